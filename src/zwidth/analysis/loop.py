@@ -95,6 +95,11 @@ class LinearLoop:
     # True if the stability boundary in the plane of alpha and beta is available, from which margins and islands follow.
     has_boundary: ClassVar[bool] = True
 
+    @property
+    def has_pieces(self) -> bool:
+        """True if the connected pieces of the stable set are available, so that `islands` and `outlines` work."""
+        return self.has_boundary
+
     @cached_property
     def chain(self) -> AnyChain:
         """Mechanical model of the device: masses, springs and dampers, or a linear system."""
@@ -227,7 +232,7 @@ class LinearLoop:
         return []
 
     def explain_limit(self) -> str:
-        """Return the reason why the stiffest wall is undecided: "", because a model decides every wall."""
+        """Return the reason why the stiffest wall is not computed; "" if the message of its status suffices."""
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:

@@ -138,7 +138,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
-        fault = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
+        fault = "this device has no K_max" if none else "K_max of this device could not be computed"
         raise click.ClickException(f"{fault}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
@@ -188,8 +188,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the islands of a scene for a record; None if they are not available, with a slow simulated tool."""
-    return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
+    """Return the islands of a scene for a record; None if they are not available, with some tools."""
+    return [island._asdict() for island in scene.islands()] if scene.loop.has_pieces else None
 
 
 def _list_obstacles(scene: Any) -> list[str]:
