@@ -28,8 +28,8 @@ from zwidth.plant.factored_plant import FactoredPlant
 from zwidth.stability.linear.delay_margin import find_delay_margins
 from zwidth.stability.linear.margins import tabulate
 
-# The zeros of a long velocity window may be inaccurate. Therefore Q from zeros and poles is compared with its
-# definition, at angles given by the smallest angle, the largest angle and their number.
+# Angles (smallest, largest, number) at which Q from its zeros and poles is compared with its definition, because the
+# zeros may be inaccurate with a long velocity window
 TEST_ANGLES = 1e-3, 3.1, 64
 TOLERANCE = 1e-8  # largest relative difference of the two values of Q
 
