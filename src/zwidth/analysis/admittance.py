@@ -290,8 +290,7 @@ class AdmittanceDisplay(Part):
 
         units = SYSTEMS[self.rotary]
         given = {name: read_texts(name, value, units[_QUANTITIES[name][0]]) for name, value in given.items()}
-        # Set M and D of the display to constants, because ``given`` contains them. Displays that differ only in M and
-        # D then form one batch.
+        # Set M and D of the display to constants, so that displays which differ only in M and D form one batch.
         K, frequency, status = ask(self._replace(1.0, 0.0), "environment_limit", *broadcast_traced(given))
         return self._label(EnvironmentLimit(K, frequency, status.astype("int32")))
 

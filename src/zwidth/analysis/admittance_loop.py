@@ -44,10 +44,10 @@ ONE: Polynomial = (Fraction(1),)
 class Coefficients(NamedTuple):
     """The four polynomials in z in the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
 
-    mass: Polynomial  # p_M, the factor of the virtual mass M
-    damping: Polynomial  # p_D, the factor of the virtual damping D
-    stiffness: Polynomial  # p_K, the factor of the stiffness K of the environment
-    environment_damping: Polynomial  # p_B, the factor of the damping B of the environment
+    mass: Polynomial  # polynomial p_M, which the virtual mass M multiplies
+    damping: Polynomial  # polynomial p_D, which the virtual damping D multiplies
+    stiffness: Polynomial  # polynomial p_K, which the stiffness K of the environment multiplies
+    environment_damping: Polynomial  # polynomial p_B, which the damping B of the environment multiplies
 
 
 class ProgramPolynomials(NamedTuple):
@@ -74,7 +74,7 @@ class RobotPolynomials(NamedTuple):
 class AdmittanceLoop:
     """The robot and the program of an admittance display, without the values of virtual mass and damping."""
 
-    robot: Any  # `Actuator` or `LinearDevice`, from the command to the motion of the robot
+    robot: Any  # `Actuator` or `LinearDevice`, the response of the robot from its command to its motion
     period: float  # T in s
     d: float  # delay in periods
     command: Command
@@ -82,7 +82,7 @@ class AdmittanceLoop:
 
     @property
     def n_delay(self) -> int:
-        """Integer part n of the delay in periods."""
+        """Integer part n of the delay of the command, in periods."""
         return int(np.floor(self.d))
 
     @cached_property
@@ -156,8 +156,7 @@ class AdmittanceLoop:
 
         sensor = _to_fractions(np.eye(len(B))[0])
         velocity = add(respond(_to_fractions(A[0])), multiply((Fraction(float(B[0])),), denominator))
-        # The numerator of V has a zero at z = 1 (W3), which cancels a pole, a drift of the position. Set its constant
-        # coefficient to exactly 0, because a rounding error would prevent the cancellation.
+        # Set the constant coefficient to exactly 0, so that the zero of V at z = 1 cancels the pole of the integrator.
         velocity = trim((*(value / Fraction(self.period) for value in velocity[:-1]), Fraction(0)))
         return RobotPolynomials(respond(sensor), velocity, denominator, self.n_delay + 1)
 

@@ -180,7 +180,6 @@ def describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) ->
         units: units in which the texts state the limit.
     """
     if limit is None or (limit.forbids_all and not ignored):
-        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
-        # this.
+        # If the safe limit excludes all walls, the reason for the missing recommendation already states this.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]

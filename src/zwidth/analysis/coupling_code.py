@@ -47,8 +47,8 @@ from zwidth.units.unit_system import UnitSystem
 class CouplingProgram(NamedTuple):
     """Program of a coupling as lists of statements in C or Python; "@" marks a state, "# " begins a comment."""
 
-    members: list[str]  # declarations of the states in C
-    start: list[str]  # statements that set the states to their values at rest, with the tool at the device
+    members: list[str]  # declarations of the states, for C code
+    start: list[str]  # statements that initialize the states at rest, with the tool at the position of the device
     force: list[str]  # statements that compute f (the force on the device is -f), and integrate the tool
 
 
@@ -148,8 +148,8 @@ def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityC
     ``position`` is the variable with the position of the device, "x" (measured) or "y" (estimate).
     """
     period, estimates = float(scene.timing.period), build_estimates(scene)
-    # If the scene has a position estimate or further feedback, estimate the velocities of tool and device separately,
-    # and subtract them. Otherwise estimate the relative velocity from the distance.
+    # Estimate the velocities of tool and device separately if the position is filtered or further feedback exists.
+    # Otherwise estimate the relative velocity from the distance between device and tool.
     prefix, newest, value, at_rest = ("tool_", "y_tool", "v_tool", "x") if estimates else ("", "e", "v", "0.0")
     estimate = estimates.of_tool if estimates else scene.velocity.estimate(period)
     count, code = estimate.window, write_filter(estimate, prefix)
@@ -158,7 +158,7 @@ def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityC
     advance = [f"@{prefix}next = (@{prefix}next + 1) % {count}"] if count > 1 else []
 
     def estimate_from(name: str, statements: list[str]) -> list[str]:
-        """Return the statements of the velocity estimate, for the variable ``name`` with its newest input."""
+        """Return statements that estimate the velocity; the variable ``name`` contains the newest position."""
         difference = f"{name} - {past}" if count else name
         entering = f"u = ({difference}) / {count}" if count > 1 else f"u = {difference}"
         scale = f"{value} = {code.gain / period!r} * u"

@@ -67,8 +67,8 @@ class CouplingLoop(LinearLoop):
         loop = self.roots
         if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:
             return np.empty((0, 2))
-        # For alpha = r beta and beta -> inf, the poles approach the zeros of r + F, because all zeros of G are poles of
-        # F. The zeros of r + F are the poles of a loop with the plant 1/F and a spring r.
+        # For alpha = r beta and beta -> inf, the poles of the loop approach the zeros of r + F.
+        # The zeros of r + F are the poles of a loop with the plant 1/F and a spring of stiffness r.
         intervals = find_stable_intervals(Boundary.trace(loop.invert_estimate()), np.zeros(1))
         return np.stack([intervals.low[0], intervals.high[0]], -1)
 
@@ -117,8 +117,8 @@ class CouplingLoop(LinearLoop):
     def is_connected(self, alpha: float, beta: float) -> bool:
         if not self.unbounded:
             return super().is_connected(alpha, beta)
-        # If all couplings with sufficiently large alpha are stable for every beta, they are connected. If one beta
-        # is stable for every alpha > 0, they are also connected to alpha = 0.
+        # All stable couplings with very large alpha are connected to each other.
+        # They are connected to alpha = 0 if one beta is stable for every alpha > 0.
         intervals = find_stable_intervals(self.boundary, np.array([beta]))
         inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
         from_zero = intervals.low[0] <= CONNECTED_START * alpha

@@ -136,8 +136,8 @@ class LimitTerms:
         """
         M, D, B, K = factors
         z, zeta, T = lam.exp(), lam.expm1(), self.period
-        # The semi-implicit method computes the virtual velocity v = T z/(M zeta + T D) f from the force f. The
-        # trapezoidal method multiplies T by ``half``, and M zeta by z (W1).
+        # The semi-implicit method computes the virtual velocity v = T z/(M zeta + T D) f from the force f.
+        # The trapezoidal method has the same response with T multiplied by ``half``, and M zeta by z (W1).
         half, mass, path = self.one, zeta, z
         if self.loop.integrator == "trapezoidal":
             half = (z + 1.0) * 0.5

@@ -29,7 +29,7 @@ from zwidth.core.status import Status
 from zwidth.model.exact_polynomials import Polynomial
 from zwidth.numerics.polynomials import companion
 
-BLOCK = 4096  # displays per call of the eigenvalue solver, which bounds the memory
+BLOCK = 4096  # largest number of displays per call of the eigenvalue solver; bounds the memory
 NEWTON_STEPS = 8  # Newton steps for the angle of a crossing; 3 suffice after the eigenvalue solver
 STEP = 1e-5  # relative step of the angle w for the numerical derivative in Newton's method
 RESIDUAL = 1e-9  # largest |Im K|/|K| at a computed crossing; K is real at an exact crossing
@@ -37,11 +37,10 @@ RESIDUAL = 1e-9  # largest |Im K|/|K| at a computed crossing; K is real at an ex
 NEAR_REAL = 1e-3
 # Smallest distance of a computed pole z from the unit circle, relative to |z - 1|, that exceeds its rounding error
 CLEARANCE = 1e-6
-LARGEST_DEGREE = 30  # largest degree of a characteristic polynomial whose roots are accurate as eigenvalues
+LARGEST_DEGREE = 30  # largest degree of a characteristic polynomial whose eigenvalues are accurate roots
 NEGLIGIBLE = 1e-18  # coefficients of a Chebyshev series below this, relative to the largest one, are rounding errors
 TESTED = (1 / 16, 1 / 2, 15 / 16)  # fractions of the limit of K: a display must be stable at all, or unstable at all
-# Angles w in rad per period. Between neighbors, the number of crossings must agree with the signs of the Chebyshev
-# series (`_confirm_angles`).
+# Angles w in rad per period at which `_confirm_angles` evaluates the Chebyshev series
 NODES = np.concatenate([np.geomspace(1e-6, 0.3, 120), np.linspace(0.3, np.pi - 1e-6, 121)[1:]])
 
 
@@ -145,8 +144,8 @@ def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     series = series[:, : used[-1] + 1] if used.size else series[:, :1]
     count, top = series.shape[1] - 1, series[:, -1:]
     is_invalid = (top[:, 0] == 0) | ~np.isfinite(series).all(-1)
-    # Build the colleague matrix, whose eigenvalues are the roots x. Row k is x U_k = (U_(k+1) + U_(k-1))/2; in the last
-    # row, the series eliminates U_(k+1).
+    # Build the colleague matrix, whose eigenvalues are the roots x, from x U_k = (U_(k+1) + U_(k-1))/2 in row k.
+    # In the last row, use the series to eliminate U_(k+1).
     matrix = np.zeros((len(series), count, count))
     matrix += (np.eye(count, k=1) + np.eye(count, k=-1)) / 2.0
     if count:
@@ -195,8 +194,7 @@ def _label_poles(polynomials: np.ndarray, factors: np.ndarray, K: np.ndarray) ->
     monic = np.concatenate([factors, K[:, None]], -1) @ polynomials
     monic = monic / monic[:, :1]
     is_valid: Any = np.isfinite(monic).all(-1)
-    # Compute zeta = z - 1 of each pole, because slow poles lie close together near z = 1. Eigenvalues zeta near 0 have
-    # small relative errors.
+    # Compute zeta = z - 1 of the poles z, because eigenvalues near 0 are more accurate than eigenvalues near 1.
     zeta: Any = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
     excess, bound = 2.0 * zeta.real + np.abs(zeta) ** 2, CLEARANCE * np.abs(zeta)  # excess is |z|^2 - 1
     is_stable, is_unstable = (excess < -bound).all(-1), (excess > bound).any(-1)

@@ -15,11 +15,11 @@ import numpy as np
 
 from zwidth.analysis.base import SceneParts
 
-# Grid of frequencies, relative to the Nyquist frequency, between which sign changes of Im x are sought. Equal ratios
-# resolve the slow poles of integrators, equal steps resolve resonances.
+# Frequencies, relative to the Nyquist frequency, between which the search looks for sign changes of Im x.
+# The geometric part resolves the slow poles of integrators, the linear part resolves resonances.
 GRID = np.unique(np.concatenate([np.geomspace(1e-7, 1.0, 4001), np.linspace(1e-4, 1.0, 8001)]))
 SPLITS = 33  # frequencies per bracket in each refinement
-REFINEMENTS = 9  # each divides the width of a bracket by 32; all together reduce it to 3e-14
+REFINEMENTS = 9  # number of refinements; each divides the width of a bracket by 32
 
 
 def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, float]:
@@ -36,7 +36,7 @@ def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, 
     nyquist = 0.5 / float(given.timing.period)
 
     def evaluate(frequency: np.ndarray) -> Any:
-        """Return x/gain with x = -(1 + L_0)/L_1, at frequencies that are relative to the Nyquist frequency."""
+        """Return x = -(1 + L_0)/L_1, relative to ``gain``, at frequencies relative to the Nyquist frequency."""
         base = _open_loop(without, frequency * nyquist)
         with np.errstate(all="ignore"):
             return -(1.0 + base) / (_open_loop(given, frequency * nyquist) - base)

@@ -38,7 +38,7 @@ LIGHT_TOOL = 1e-4  # lower end of both ranges for a light tool of mass M, relati
 PER_DECADE_ON_LINE = 24  # points per decade on a line of constant alpha or beta
 INSERTED = 12  # points inserted at each extremum of the spectral radius that may hide two crossings of 1
 INSERTIONS = 2  # largest number of passes that insert such points
-PER_DECADE = 8  # points per decade of the first grid in the plane
+PER_DECADE = 8  # points per decade of the first grid in the plane of alpha and beta
 FINE_DECADES, FINE_PER_DECADE = 2, 32  # decades below the largest stable alpha with a fine grid; points per decade
 POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # values of beta on the fine grid: number per N, and its limits
 SUMMITS = 3  # number of local maxima of the fine grid, the highest ones, that are refined
@@ -46,7 +46,7 @@ SUMMITS = 3  # number of local maxima of the fine grid, the highest ones, that a
 # Refinement of a local maximum of alpha in a window of alpha and beta
 ROWS, COLUMNS = 12, 17  # points of alpha and of beta in the window
 FIRST_HEIGHT = 0.1  # height of the first window, relative to alpha
-SHRINK_HEIGHT, SHRINK_WIDTH = 1 / 3, 0.5  # ratios of height and width of two successive windows
+SHRINK_HEIGHT, SHRINK_WIDTH = 1 / 3, 0.5  # factors by which height and width of the window shrink
 MAX_ZOOMS = 300  # largest number of windows
 CLOSE = 1e-13  # size of the last window, relative to alpha and beta
 SAME_MODULUS = 1e-6  # poles z with |log|z|| below this (per N periods) count as poles on the unit circle
@@ -91,8 +91,7 @@ class SlowToolLoop(LinearLoop):
             raise InputError(f"method: got {method!r} with tool.every = {self.model.every}; use 'companion'")
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         logs = self._compute_logs(*nan_beyond(WALL_RANGE, alpha, beta))
-        # With alpha = 0, a free device and a free tool drift apart: one pole is at exactly z = 1, and the coupling is
-        # unstable, not undecided.
+        # With alpha = 0, a pole may be at exactly z = 1 (device and tool drift apart); the coupling is then unstable.
         doubtful = (logs == 0) & (np.asarray(alpha) != 0)
         status = np.where((status == Status.OK) & doubtful, np.int32(Status.ON_BOUNDARY), status)
         status = np.where((status == Status.OK) & np.isnan(logs), np.int32(Status.NOT_CONVERGED), status)
@@ -133,8 +132,7 @@ class SlowToolLoop(LinearLoop):
         wall = LinearLoop(self.scene.replace(tool=None)).stiffest(False)
         alpha = float(wall.alpha) if wall.status == Status.OK and wall.alpha > 0 else 1.0
         beta = max(alpha, float(wall.beta)) if np.isfinite(wall.beta) else alpha
-        # With a fixed device, a tool of mass M with steps of N T is stable only for alpha up to 4 M/(m N^2). Start the
-        # grids far below this limit.
+        # Start the grids far below 4 M/(m N^2), the largest stable alpha of a tool of mass M on a fixed device.
         light = LIGHT_TOOL / self.model.gain
         return (
             (min(LOWEST * alpha, light), HIGHEST * alpha),
@@ -200,8 +198,7 @@ class SlowToolLoop(LinearLoop):
         stable = self._compute_logs(alpha[:, None], beta) < 0
         if not stable.any():
             return []
-        # Use a fine grid for stiff couplings, because the device may oscillate up to N/2 times between two steps of the
-        # tool.
+        # Use a fine grid for stiff couplings, because the device may oscillate N/2 times per step of the tool.
         top = np.flatnonzero(stable.any(1))[-1]
         if top == alpha.size - 1:
             return None
@@ -257,13 +254,11 @@ class SlowToolLoop(LinearLoop):
         for _ in range(MAX_ZOOMS):
             rows, columns = np.linspace(alpha, alpha + height, ROWS), beta + width * np.linspace(-1.0, 1.0, COLUMNS)
             logs = self._compute_logs(rows[:, None], np.maximum(columns, 0.0))
-            # Take the last row before the first one without a stable coupling, because stable couplings above that one
-            # may belong to another region.
+            # Stay below the first row without stable couplings, because rows above it may belong to another region.
             row = max(int(np.argmin(np.append((logs < 0).any(1)[1:], False))), 0)
             column = int(np.argmin(logs[row]))
             alpha, beta = float(rows[row]), max(float(columns[column]), 0.0)
-            # Enlarge the window if the best coupling is at its edge, because the maximum may be outside; otherwise
-            # shrink it.
+            # Enlarge the window if the best coupling is at its edge, because the maximum may be outside. Else shrink.
             at_side = column in (0, COLUMNS - 1) and columns[column] > 0
             if row == ROWS - 1:
                 height = min(height / SHRINK_HEIGHT, highest)

@@ -41,13 +41,10 @@ if TYPE_CHECKING:
 NODES = 800  # number of frequencies at which the condition of `is_safe_for_every_world` is evaluated
 LOWEST = 1e-4  # lowest of these frequencies, in rad per period
 MAX_FREQUENCIES = 24  # largest number of violating frequencies for which worlds are constructed
-MAX_MASSES = 6  # masses of the hand per frequency
-HEAVIEST = 1e4  # ratio of the heaviest to the lightest mass of the hand
+MAX_MASSES = 6  # number of masses of the hand that are tested per frequency
+HEAVIEST = 1e4  # ratio of the largest to the smallest of these masses
 LEAST_GROWTH = 1e-13  # smallest logarithm of the spectral radius that counts as unstable, above rounding errors
-TOOL_MASSES = (
-    1e-6,
-    1e9,
-)  # smallest and largest mass of the tool, relative to the device; the largest stands for infinity
+TOOL_MASSES = 1e-6, 1e9  # smallest and largest mass of the tool, relative to the mass of the device
 
 
 @compact_repr(

@@ -301,8 +301,7 @@ def find_gains(
     if feedback is not None:
         integrated = isinstance(feedback, IntegralFeedback) and feedback.is_cascade == is_cascade
         if is_cascade and integrated:
-            # Compare pos_gain B with K, not pos_gain with K/B, because B may be small. The tolerance allows K and B
-            # that are rounded to six digits.
+            # Compare pos_gain B with K, because B may be small; K and B may be rounded to six digits.
             integrated = abs(feedback.position / feedback.velocity * B - K) <= 1e-5 * abs(K)
         if not integrated or (not is_cascade and feedback.velocity):
             allowed = "the integrator of a cascade with pos_gain = K/B" if is_cascade else "an integral of the position"

@@ -61,7 +61,7 @@ class JointDevice(LinearDevice):
     Its dotted path in a scene is "joints.k.damping", such as "joints.0.damping".
     """
 
-    system: Any = field(init=False, default=None)  # computed from the joints
+    system: Any = field(init=False, default=None)  # linear system, computed from the matrices of the joints
     joints: Joints | None = None
 
     def __post_init__(self, sampled: Any) -> None:
@@ -256,7 +256,7 @@ def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
 
 
 def _read_array(name: str, value: Any) -> np.ndarray:
-    """Return an array of finite numbers; ``name`` is the name of the field for error messages."""
+    """Convert a value to an array of finite numbers; ``name`` is the name of the field in error messages."""
     try:
         array = np.array(value, float)
     except (TypeError, ValueError):

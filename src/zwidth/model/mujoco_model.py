@@ -219,8 +219,7 @@ def _read_position(model: Any, index: int, value: Any) -> float:
     """
     (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
     name = model.joint(int(joint)).name
-    # Accept a number as text, because NumPy converts all entries of an array to texts if one entry is a text. A number
-    # without a unit is in rad or m.
+    # Accept a number as text, because NumPy converts all entries of an array to texts if one of them is a text.
     value = float(value) if isinstance(value, str) and looks_like_number(value) else value
     unit = "m" if list_joints(model).get(name) == "slide" else "rad"
     return check_number(f"pose.{name}", value, unit, ANY)

@@ -72,8 +72,7 @@ class Timing(Part):
         timing, (period, delay) = object.__new__(cls), children
         values = {"period": period, "delay": delay, "rate": None}
         if structure:
-            # Do not convert the delay to seconds if JAX passes objects that cannot be multiplied, or derivatives,
-            # because a product of derivatives is no delay.
+            # Convert the delay to seconds unless JAX passes derivatives, or objects that cannot be multiplied.
             with suppress(TypeError):
                 values["delay"] = delay if _is_derivative(period, delay) else delay * period
             values |= {"_periods": delay, "in_periods": True}
@@ -106,7 +105,7 @@ class Timing(Part):
 
 
 def _is_derivative(period: Any, count: Any) -> bool:
-    """Return whether period and number of periods are derivatives, because one of them is out of range."""
+    """Return True if period or number of periods is out of range: JAX then stores derivatives in a `Timing`."""
     if is_traced(period, count) or np.ndim(period) or np.ndim(count):
         return False
     return float(period) <= 0 or float(count) < 0

@@ -73,12 +73,13 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
     """
     plant, F = add_plants(device, tool), device.estimate
     if estimates is None or estimates.structure == "series":
-        # Because V = P F and V_t = F, the force of the coupling is (alpha + beta F) (P x - y), with the estimate F.
+        # Because V = P F and V_t = F, the force of the coupling is (alpha + beta F) (P x - y).
         return LoopRoots(**vars(plant), estimate=F)
     V, gain, lag = estimates.velocity, device.gain * float(F.gain), device.lag + F.lag
     if estimates.structure == "separate":
-        # Because V_t = V, V H + V_t G_t = V (H + G_t). The first zeros of F = V/P are those of V, the others are the
-        # poles of P. If V is an input of R, the poles of V are zeros of H, and cancel in V H.
+        # Because V_t = V, the velocity part of the loop is V H + V_t G_t = V (H + G_t).
+        # The zeros of F = V/P are first those of V, then the poles of P.
+        # If V is an input of R, the poles of V are zeros of H, and cancel in V H.
         released = V.poles[: 0 if device.free_poles.size else None]
         zeros = np.concatenate([device.free_zeros, F.zeros[np.size(V.zeros) :], released])
         outer, second = V, tool

@@ -28,8 +28,7 @@ from zwidth.plant.factored_plant import FactoredPlant
 from zwidth.stability.linear.delay_margin import find_delay_margins
 from zwidth.stability.linear.margins import tabulate
 
-# Angles (smallest, largest, number) at which Q from its zeros and poles is compared with its definition, because the
-# zeros may be inaccurate with a long velocity window
+# Angles at which Q is checked, because its zeros may be inaccurate: smallest angle, largest angle, number of angles
 TEST_ANGLES = 1e-3, 3.1, 64
 TOLERANCE = 1e-8  # largest relative difference of the two values of Q
 
@@ -88,14 +87,14 @@ def _compose_controller(estimates: LoopEstimates, tool: FactoredPlant, alpha: fl
 
 
 def _factor(estimate: Estimate) -> FactoredPlant:
-    """Convert an estimate to gain, zeros and poles; its difference over n periods becomes n zeros."""
+    """Convert an estimate to gain, lag, zeros and poles; a difference over n periods contributes n zeros."""
     n = estimate.window
     zeros = np.concatenate([estimate.zeros, np.zeros(min(n, 1)), estimate.list_window_zeros()])
     return FactoredPlant(float(estimate.gain) / max(n, 1), estimate.lag + n, zeros, np.asarray(estimate.poles))
 
 
 def _multiply(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
-    """Return the product of two filters in factored form."""
+    """Return the product of two filters, all given by gain, lag, zeros and poles."""
     zeros, poles = ([getattr(each, name) for each in (first, second)] for name in ("zeros", "poles"))
     return FactoredPlant(first.gain * second.gain, first.lag + second.lag, np.concatenate(zeros), np.concatenate(poles))
 
@@ -105,7 +104,7 @@ def _add(first: FactoredPlant, second: FactoredPlant, a: float = 1.0, b: float =
     if not a or not b:
         filter_, factor = (first, a) if a else (second, b)
         return replace(filter_, gain=factor * filter_.gain)
-    # Multiply both filters by the same power of z, so that the second one has no factor 1/z. Undo this at the end.
+    # Multiply both filters by z^lag with the lag of the second filter; the last line divides the sum by it.
     lag = second.lag
     moved = [replace(first, gain=a * first.gain, lag=first.lag - lag), replace(second, gain=b * second.gain, lag=0)]
     early = max(lag - first.lag, 0)

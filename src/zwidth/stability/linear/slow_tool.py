@@ -34,8 +34,8 @@ from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.poles import log_modulus
 
 BLOCK_SIZE = 1 << 21  # values per block of couplings; a monodromy matrix has states^2 values
-# Largest |log|eigenvalue|| that counts as on the unit circle: ON_CIRCLE or, if larger, ROUNDING divided by the distance
-# from the dominant eigenvalue to the nearest other one.
+# An eigenvalue counts as on the unit circle if |log|eigenvalue|| is below ON_CIRCLE or its rounding error.
+# The rounding error is ROUNDING divided by the distance to the nearest other eigenvalue.
 ON_CIRCLE, ROUNDING = 1e-13, 1e-15
 LARGEST = 1e100  # entry of a monodromy matrix above which the products H S, H^2 S, ... are scaled against overflow
 
@@ -55,7 +55,7 @@ class SlowToolModel:
     increment: Array  # row of w, the increment of y per step
     step: Array  # row of the change of w in a step of the tool without a coupling force
     moved: Array  # change of the state if y increases by 1 while the device stays where it is
-    gain: float  # gain of the step of the tool
+    gain: float  # change of w per unit of the force f in a step of the tool
     feedthrough: float | None  # direct feedthrough of the velocity estimate; None for "semi-implicit"
 
     @classmethod
@@ -121,7 +121,7 @@ class SlowToolModel:
         return multipliers, logs
 
     def _build_maps(self, alpha: Array, beta: Array) -> tuple[Array, Array]:
-        """Return, per coupling, the maps H (no step of the tool) and S (one step) of a period, minus the identity."""
+        """Return the matrices H and S (period without and with a step of the tool) minus the identity, per coupling."""
         f = alpha[:, None] * self.distance + beta[:, None] * self.velocity
         hold = self.drift - self.force[:, None] * f[:, None, :]
         change = self.step + self.gain * f
