@@ -228,9 +228,9 @@ class SceneOptima(SceneAnalysis):
 
         Args:
             negative_damping: True if walls with B < 0 count. By default they count only for a `Device` with the
-                backward difference. With a filter a negative B is a lead compensator; with a `LinearDevice` or a
-                `MeasuredDevice` it would cancel damping of the model, which is unsafe. The pieces of the stable set do
-                not depend on this argument: a path may lead through B < 0.
+                backward difference and without a tool. With a filter a negative B is a lead compensator; with a
+                `LinearDevice` or a `MeasuredDevice` it would cancel damping of the model, which is unsafe. The pieces
+                of the stable set do not depend on this argument: a path may lead through B < 0.
 
         Returns:
             ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,

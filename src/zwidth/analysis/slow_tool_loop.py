@@ -67,8 +67,8 @@ class SlowToolLoop(LinearLoop):
     def roots(self) -> LoopRoots:
         """Poles and zeros of the loop without a wall, which a periodic loop lacks: always raises `InputError`."""
         raise InputError(
-            f"tool.every: got {self.scene.tool.every}, which allows only stability, spectral radius, poles, stable "
-            "intervals and maximum stiffness; set every=1 for other results"
+            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; with larger "
+            "values, only stability, spectral radius, poles, stable intervals and maximum stiffness are available"
         )
 
     @cached_property

@@ -48,6 +48,7 @@ FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which i
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
 MATCHED = 1e-5  # relative change of K/B at which the search for a wall that matches the integrator of a cascade ends
+RESTARTS = (0.5, 0.1, 0.02)  # pos_gain of further searches, relative to that of the wall without integrator
 MAX_MATCHES = 8  # walls that this search chooses; 3 usually suffice
 # Factors on K and B, tried in this order, until a wall satisfies the requirements with the integrator that matches it.
 REDUCTIONS = (1.0, 1.0 - 1e-5, 1.0 - 1e-4, 0.999, 0.99, 0.97, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
@@ -333,15 +334,15 @@ def _choose_free(
         usual = min(max(usual, low), high)
     spare = slack(most, usual)
     if spare and not (requirements.stiffness_fraction and min(spare.values()) >= 0):
-        stiffness, damping = find_stiffest(scene, slack, most, near, width, safe)
+        # Return before the search, which may take half a minute, if the damping excludes every passive wall.
+        reason, reserve = "", 0.0 if safe is None else safe.damping_reserve
+        if requirements.passive and scene.device.damping == 0:
+            reason = "no passive wall exists, because the device has no physical damping"
+        elif requirements.passive and scene.device.damping <= reserve:
+            reason = "no wall is passive for certain, because the device may have no physical damping; record longer"
+        stiffness, damping = (nan, nan) if reason else find_stiffest(scene, slack, most, near, width, safe)
         if math.isnan(stiffness):
-            reason = f"no wall satisfies {' and '.join(map(requirements.spell, spare))}; relax a requirement"
-            if requirements.passive and scene.device.damping == 0:
-                reason = "no passive wall exists, because the device has no physical damping"
-            elif requirements.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
-                reason = (
-                    "no wall is passive for certain, because the device may have no physical damping; record longer"
-                )
+            reason = reason or f"no wall satisfies {' and '.join(map(requirements.spell, spare))}; relax a requirement"
             return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
         spare = slack(stiffness, damping)
         limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active
@@ -378,13 +379,37 @@ def choose_controller(
     feedback = scene.feedback
     if not (isinstance(feedback, IntegralFeedback) and feedback.is_cascade):
         return ControllerChoice(scene, top, choice)
-    nan = math.nan
+    first = result = _match_integrator(scene, feedback, requirements, top, choice, width)
+    if result.wall.status != Status.OK:
+        # Start again from smaller values of pos_gain, because the given one may be too large for every wall.
+        free = scene.replace(feedback=None)
+        start = choose_wall(free, requirements, free.max_stiffness(), None, COARSE)
+        for factor in RESTARTS if start.status == Status.OK and start.damping > 0 else ():
+            feedback = feedback.match_wall(factor * start.stiffness, start.damping)
+            changed = scene.replace(feedback=feedback)
+            top = changed.max_stiffness()
+            choice = choose_wall(changed, requirements, top, None, width)
+            result = _match_integrator(changed, feedback, requirements, top, choice, width)
+            if result.wall.status == Status.OK:
+                return result
+    return first if result.wall.status != Status.OK else result
+
+
+def _match_integrator(
+    scene: SceneOptima,
+    feedback: IntegralFeedback,
+    requirements: Requirements,
+    top: StiffestWall,
+    choice: WallChoice,
+    width: float,
+) -> ControllerChoice:
+    """Choose walls until the integrator of a cascade matches the wall; ``choice`` is the first wall of ``scene``."""
     for _ in range(MAX_MATCHES):
         if choice.status != Status.OK:
             return ControllerChoice(scene, top, choice)
         if not choice.damping > 0:
             reason = "no wall with B > 0 satisfies the requirements, and a cascade requires pos_gain = K/B > 0"
-            return ControllerChoice(scene, top, WallChoice(nan, nan, "", Status.UNREACHABLE, reason))
+            return ControllerChoice(scene, top, WallChoice(math.nan, math.nan, "", Status.UNREACHABLE, reason))
         matched = feedback.match_wall(choice.stiffness, choice.damping)
         changed = abs(matched.position - feedback.position) > max(MATCHED, width) * abs(matched.position)
         feedback, scene = matched, scene.replace(feedback=matched)

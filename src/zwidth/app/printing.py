@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from zwidth.core.status import Status
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.parameter_paths import WITH_KIND, find_parts
 from zwidth.model.wall import NoWall
-from zwidth.units.formatting import plain, short, to_json, with_unit
+from zwidth.units.formatting import format_stiffness, plain, short, to_json, with_unit
 from zwidth.units.quantities import FIELDS
 
 if TYPE_CHECKING:
@@ -169,21 +170,33 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def list_tool_notes(scene: Scene) -> list[str]:
-    """Return a note on the stability of a virtual coupling with other tools than the scene's; empty without a tool."""
+    """Return notes on a scene with a tool: on K_max, and on other tools than the scene's; empty without a tool."""
     if scene.tool is None:
         return []
     if scene.tool.every > 1:
-        rate = with_unit(1.0 / (scene.tool.every * scene.timing.period), "Hz")
-        return [
-            f"K and B are those of a virtual coupling; its tool makes one step per {scene.tool.every} periods, at "
-            f"{rate}; margins and islands are not computed"
-        ]
-    if scene.tool.integrator == "semi-implicit":
-        return [
-            "K and B are those of a virtual coupling; its tool, in semi-implicit Euler, is not passive, so a coupling "
-            "that is safe for every passive world may be unstable with it; lightest_tool returns the smallest mass"
-        ]
-    return ["K and B are those of a virtual coupling; is_safe_for_every_world includes every tool in implicit Euler"]
+        rate, every = with_unit(1.0 / (scene.tool.every * scene.timing.period), "Hz"), scene.tool.every
+        text = f"; its tool makes one step per {every} periods, at {rate}; margins and islands are not computed"
+    elif scene.tool.integrator == "semi-implicit":
+        text = (
+            "; its tool is integrated by semi-implicit Euler and therefore not passive, so a coupling that is safe for "
+            "every passive world may be unstable with it; lightest_tool returns the smallest mass"
+        )
+    else:
+        text = ""
+    return [f"K and B are those of a virtual coupling{text}", *_list_narrow_regions(scene)]
+
+
+def _list_narrow_regions(scene: Scene) -> list[str]:
+    """Return a caution if a coupling with half of K_max, at the damping of K_max, is unstable."""
+    top = scene.max_stiffness()
+    half = 0.5 * float(top.stiffness)
+    if top.status != Status.OK or scene.is_stable(half, float(top.virtual_damping)):
+        return []
+    K = format_stiffness(half, scene.unit_system)
+    return [
+        f"do not set a coupling near K_max: it is in a narrow region, since K = {K} at the same B is unstable; choose "
+        "a smaller B, and K in the line 'room' of zwidth check"
+    ]
 
 
 def compare_with_limit(scene: Scene) -> list[str]:

@@ -119,10 +119,13 @@ def format_check(
     if word == "UNSTABLE" and damper and dampings:
         lines.append(format_line("remedy", f"a pure damper: {_spell_intervals('B', dampings, units['N s/m'], 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
-        changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
-        lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
-        advice = ": for a wall to set, use recommend" if scene.loop.has_boundary else ""
-        lines.append(format_line("", f"these are limits of stability, without margins{advice}"))
+        changes = [each.spell() for each in stabilize(scene)]
+        if not changes:
+            lines.append(format_line("remedy", "no stabilizing change of one parameter was found"))
+        else:
+            lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
+            advice = ": for a wall to set, use recommend" if scene.loop.has_boundary else ""
+            lines.append(format_line("", f"these are limits of stability, without margins{advice}"))
     lines += format_margins(verdict)
     lines += format_decay(verdict)
     if word != "UNSTABLE" or verbose:

@@ -14,6 +14,7 @@ from typing import Any
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Part, check_number
 from zwidth.units.formatting import format_wall
+from zwidth.units.quantities import Range
 from zwidth.units.unit_system import UnitSystem
 
 ROUNDING = 5e-4  # relative tolerance of `allows`, so that the limit allows a wall that is rounded to four digits
@@ -74,11 +75,13 @@ class SafeLimit(Part):
         scaled = min(stiffness / self.stiffness, 1.0) * self.virtual_damping
         return min(scaled, self.virtual_damping), max(scaled, self.virtual_damping)
 
-    def allows(self, stiffness: float, virtual_damping: float) -> bool:
+    def allows(self, stiffness: float | str, virtual_damping: float | str) -> bool:
         """Return whether the limit allows a wall, within a relative tolerance of ``ROUNDING``."""
-        ends = self.dampings(stiffness)
+        K = check_number("stiffness", stiffness, self.unit_system["N/m"], Range())
+        B = check_number("virtual_damping", virtual_damping, self.unit_system["N s/m"], Range())
+        ends = self.dampings(K)
         slack = ROUNDING * abs(self.virtual_damping)
-        return ends is not None and ends[0] - slack <= virtual_damping <= ends[1] + slack
+        return ends is not None and ends[0] - slack <= B <= ends[1] + slack
 
     def warn(self, text: str) -> SafeLimit:
         """Return a copy with an additional warning; the limit itself if it contains this warning already."""

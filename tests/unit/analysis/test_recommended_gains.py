@@ -62,3 +62,12 @@ def test_gains_that_belong_to_another_controller_are_refused():
     unstable = zwidth.Scene(MOTOR, TIMING, **zwidth.cascade(20, 0.16, 1e4)).recommend()
     with pytest.raises(InputError, match="there is no wall"):
         unstable.cascade_gains()
+
+
+def test_the_result_does_not_depend_on_the_given_pos_gain():
+    def recommend(pos_gain):
+        return zwidth.Scene(MOTOR, TIMING, **zwidth.cascade(pos_gain, 0.16, 10)).recommend(phase_margin=50)
+
+    low, high = recommend(20), recommend(20_000)
+    assert high.stiffness == pytest.approx(low.stiffness, rel=1e-3)
+    assert high.cascade_gains() == pytest.approx(low.cascade_gains(), rel=0.01)

@@ -403,3 +403,10 @@ def test_passivity_and_margins_with_components_are_printed(options, text):
     if "--velocity-cutoff" not in options:
         margins = r"^margins +gain [0-9.]+, phase -?[0-9.]+ deg at .*, delay .*s, modulus"
         assert re.search(margins, output, re.MULTILINE)
+
+
+def test_without_a_remedy_no_limits_are_mentioned():
+    # Five integrators: no stiffness and no damping stabilize the device.
+    text = run("check", "--stiffness", "1000", "--device", "1 / 0.1 10 0 0 0 0 0", *RATE).stdout
+    assert "remedy     no stabilizing change of one parameter was found\n" in text
+    assert "limits of stability" not in text

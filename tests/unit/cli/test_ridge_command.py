@@ -94,3 +94,21 @@ def test_maximum_above_the_safe_limit_has_a_caution(tmp_path):
     assert cautions == [f"this wall exceeds the safe limit: {caution}", "the clock jumps"]
     file.write_text(FITTED.format("{stiffness: 30 kN/m, virtual_damping: 50 N s/m}"))
     assert "CAUTION" not in ridge(str(file))
+
+
+@pytest.mark.parametrize(
+    ("tool", "narrow"),
+    [
+        (["--tool-mass", "300 g"], False),
+        (["--tool-mass", "300 g", "--tool-every", "16"], True),
+        (["--tool-mass", "30 g", "--delay", "1 ms"], True),
+    ],
+)
+def test_largest_coupling_in_a_narrow_region_is_named(tool, narrow):
+    system = ["--mass", "100 g", "--damping", "10", "--rate", "1 kHz", *tool]
+    found = json.loads(ridge(*system, "--json"))
+    half = [f"{0.5 * found['stiffness_max']} N/m", f"{found['virtual_damping']} N s/m"]
+    wall = ["--stiffness", half[0], "--virtual-damping", half[1]]
+    checked = CliRunner().invoke(cli, ["check", *system, *wall])
+    assert checked.output.startswith("UNSTABLE" if narrow else "STABLE")
+    assert any("do not set a coupling near K_max" in note for note in found["notes"]) == narrow

@@ -24,6 +24,8 @@ SCENE = zwidth.Scene(DEVICE, TIMING, safe_limit=LIMIT)
         ((242, 0.5), False),
         ((100, 1.2), False),
         ((-1, 0.5), False),
+        (("0.1 kN/m", "1130 mN s/m"), True),
+        (("0.485 kN/m", 1.13), False),
     ],
 )
 def test_limit_allows_softer_and_scaled_walls(wall, allowed):

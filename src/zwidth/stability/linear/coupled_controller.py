@@ -13,10 +13,12 @@ power of z. Q may have poles outside the unit circle.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
+from zwidth.model.circle_functions import CirclePoints, circle_points
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.mechanism import AnyChain
@@ -24,6 +26,11 @@ from zwidth.plant.composed_plant import add_plants
 from zwidth.plant.factored_plant import FactoredPlant
 from zwidth.stability.linear.delay_margin import find_delay_margins
 from zwidth.stability.linear.margins import tabulate
+
+# The zeros of a long velocity window may be inaccurate. Therefore Q from zeros and poles is compared with its
+# definition, at angles given by the smallest angle, the largest angle and their number.
+TEST_ANGLES = 1e-3, 3.1, 64
+TOLERANCE = 1e-8  # largest relative difference of the two values of Q
 
 
 def find_coupling_delay_margin(chain: AnyChain, tool: FactoredPlant, alpha: float, beta: float) -> float:
@@ -36,11 +43,27 @@ def find_coupling_delay_margin(chain: AnyChain, tool: FactoredPlant, alpha: floa
         beta: normalized damping of the coupling.
 
     Returns:
-        The margin; inf if the coupling is stable with any delay, NaN if the result is not confirmed.
+        The margin; inf if the coupling is stable with any delay. NaN if the result is not confirmed, or if rounding
+        errors of Q are too large.
     """
-    Q = _compose_controller(chain.estimates or LoopEstimates(velocity=chain.estimate), tool, alpha, beta)
+    estimates = chain.estimates or LoopEstimates(velocity=chain.estimate)
+    Q = _compose_controller(estimates, tool, alpha, beta)
+    points = circle_points(np.geomspace(*TEST_ANGLES))
+    expected = _evaluate_controller(estimates, tool, alpha, beta, points)
+    error = np.abs(Q.evaluate_response(points).value - expected)
+    if not np.all(error <= TOLERANCE * np.abs(expected)):
+        return math.nan
     folded = replace(chain, estimates=LoopEstimates(position=Estimate(0, Q.gain, Q.lag, Q.zeros, Q.poles)))
     return float(find_delay_margins(folded, tabulate, np.ones(1), np.zeros(1))[0])
+
+
+def _evaluate_controller(
+    estimates: LoopEstimates, tool: FactoredPlant, alpha: float, beta: float, points: CirclePoints
+) -> np.ndarray:
+    """Return Q at points of the unit circle, computed by its definition."""
+    P, V, *R = (term(points).value for term in estimates.respond())
+    returned = (alpha + beta * estimates.of_tool.jet(points).value) * tool.evaluate_response(points).value
+    return (alpha * P + beta * V) / (1.0 + returned) + sum(R)
 
 
 def _compose_controller(estimates: LoopEstimates, tool: FactoredPlant, alpha: float, beta: float) -> FactoredPlant:
