@@ -170,7 +170,7 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def list_tool_notes(scene: Scene) -> list[str]:
-    """Return notes on a scene with a tool: on K_max, and on other tools than the scene's; empty without a tool."""
+    """Return notes on a scene with a simulated tool: on other tools, and on K_max; an empty list without a tool."""
     if scene.tool is None:
         return []
     if scene.tool.every > 1:

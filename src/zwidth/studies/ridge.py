@@ -58,8 +58,8 @@ class RidgeStudy(CurvesStudy):
     kind: Literal["ridge"]
 
     device: PhysicalDevice | None = None
-    """Device in SI units. The curves include its parts, such as filters. Default: the scene, if it has parts and delta or
-    d is not given."""
+    """Device in SI units. The curves include its parts, such as filters. Default: that of the scene, if it has parts
+    and delta or d is not given."""
 
     two_scalings: bool = False
     """True to show small values of delta in a separate panel, as in Fig. 10 of the paper."""
