@@ -188,7 +188,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the stability islands of a scene as dicts; None for a slow tool (``every`` > 1), where they are not computed."""
+    """Return the stability islands of a scene as dicts; None for a tool with ``every`` > 1 (not available)."""
     return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
 
 

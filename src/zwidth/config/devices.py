@@ -3,8 +3,8 @@
 Sections are either in SI units ("physical") or normalized; `OneKind` reports keys of the other kind. A linear system
 or a measured response replaces mass, damping and mechanical parts. A linear system has one of four forms: numerator and
 denominator; zeros, poles and gain; the matrices A, B and C; or second-order sections. An arm with several joints
-(`zwidth.config.joint_devices`) is a linear system, or a *rigid* arm: along the direction of the wall it moves like one
-mass, and its mass and damping replace it.
+(`zwidth.config.joint_devices`) is a linear system. If the arm moves like one mass along the direction of the wall, the
+keys ``mass`` and ``damping`` replace it.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def read_device_form(raw: Any) -> _Section:
 
 
 def replace_rigid(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace the key ``device`` of a mapping by the keys ``mass`` and ``damping`` if the device is a rigid arm.
+    """Replace the key ``device`` of a mapping by ``mass`` and ``damping`` if it is an arm that moves like one mass.
 
     Return the mapping unchanged for other devices. Also return it unchanged if the arm is invalid or if the mapping
     contains mass or damping, because the validation reports both errors.
@@ -283,7 +283,7 @@ class SampledMass(OneKind):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Replace the name of a published device, or a rigid arm, by mass and damping.
+        """Replace the name of a published device, or an arm that moves like one mass, by mass and damping.
 
         Keys of the section override those of a published device.
         """
