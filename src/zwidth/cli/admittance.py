@@ -232,7 +232,9 @@ def _assess(display: Any, stiffness: float, damping: float, limit: Any) -> tuple
         lines[-1] += f"; this environment has {plain(used, 3)} % of K_max"
     ranges = (("M", mass.virtual_mass, mass.largest, "kg"), ("D", least.virtual_damping, least.largest, "N s/m"))
     spelled = [_spell_range(name, low, high, units[unit]) for name, low, high, unit in ranges]
-    lines.append(format_line("room" if is_stable else "remedy", f"{'; '.join(spelled)}, each alone"))
+    lines.append(
+        format_line("room" if is_stable else "remedy", f"{'; '.join(spelled)}, each alone; no margins at the ends")
+    )
     return result, lines
 
 

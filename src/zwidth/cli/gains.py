@@ -163,7 +163,11 @@ def _format_controller(controller: _GivenController) -> list[str]:
             ends = format_interval(low, high)
             spans.append(f"{name} from {'0' if not low else ends[0]} to {ends[1]} {units[name]}")
         if spans:
-            lines.append(format_line("limits", f"{'; '.join(spans)}; each with the other gains unchanged"))
+            lines.append(
+                format_line(
+                    "limits", f"{'; '.join(spans)}; each with the other gains unchanged; no margins at the ends"
+                )
+            )
     return lines
 
 

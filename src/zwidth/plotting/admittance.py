@@ -79,6 +79,6 @@ def _spell(value: float, unit: str) -> str:
 def _name_case(case: tuple[float, float], cases: list[tuple[float, float]]) -> str:
     """Return the legend entry of a case (d, B), without d or B if all cases have the same value."""
     varied: list[Any] = [len(set(column)) > 1 for column in zip(*cases, strict=True)]
-    words = [f"delay {short(case[0])} periods"] if varied[0] else []
+    words = [f"delay {short(case[0])} period{'' if case[0] == 1 else 's'}"] if varied[0] else []
     words += [f"$B$ = {_spell(case[1], 'N s/m')}"] if varied[1] else []
     return ", ".join(words)
