@@ -39,7 +39,7 @@ from zwidth.units.unit_system import SYSTEMS
 NEGLIGIBLE = 1e-11
 # Largest asymmetry of a matrix, relative to its largest entry, that is attributed to rounding errors.
 ASYMMETRY = 1e-6
-# Units of the fields for slides; the corresponding units of rotation are those for hinges.
+# Unit of each field for slides (prismatic joints); hinges have the corresponding unit of rotation.
 _UNITS = {"mass_matrix": "kg", "damping": "N s/m", "stiffness": "N/m"}
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -55,17 +55,17 @@ class Joints(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class JointDevice(LinearDevice):
-    """The linear system along one direction of an arm with several joints, with the dampings of its joints.
+    """Linear system of an arm with several joints along one direction, whose parameters are the joint dampings.
 
     `from_mass_matrix` creates it. The damping of joint k, counted from 0, is the entry (k, k) of the damping matrix D.
     Its dotted path in a scene is "joints.k.damping", such as "joints.0.damping".
     """
 
-    system: Any = field(init=False, default=None)  # computed from the joints
+    system: Any = field(init=False, default=None)  # linear system, computed from the matrices of the joints
     joints: Joints | None = None
 
     def __post_init__(self, sampled: Any) -> None:
-        # Compute the system from the matrices in every case, so that both always agree.
+        # Always compute the system from the matrices of the joints, so that both agree.
         M, D, S, vector = map(np.array, self._get_joints())
         reduced = _reduce(*_normalize(np.linalg.cholesky(M), vector, D, S))
         object.__setattr__(self, "system", _realize(*reduced))
@@ -80,7 +80,7 @@ class JointDevice(LinearDevice):
         """Return the value of the key ``device`` of a configuration."""
         joints = self._get_joints()
         matrices = {name: [list(row) for row in getattr(joints, name)] for name in joints._fields[:3]}
-        # The vector is that of a Jacobian with one row, for which the direction is omitted.
+        # Write the vector J' n as a Jacobian with one row, which needs no direction.
         return {**matrices, "jacobian": [list(joints.vector)]}
 
     def _get_joints(self) -> Joints:
@@ -94,7 +94,7 @@ class JointDevice(LinearDevice):
         return {f"joints.{k}.damping": row[k] for k, row in enumerate(self._get_joints().damping)}
 
     def replace_dampings(self, values: dict[str, Any]) -> JointDevice:
-        """Return the device with other dampings of some joints; ``values`` contains them by dotted path."""
+        """Return a copy of the device with new joint dampings; ``values`` maps dotted paths to dampings."""
         joints, paths = self._get_joints(), list(self.joint_dampings)
         damping = np.array(joints.damping)
         for path, value in values.items():
@@ -256,7 +256,7 @@ def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
 
 
 def _read_array(name: str, value: Any) -> np.ndarray:
-    """Return an array of finite numbers; ``name`` is the name of the field for error messages."""
+    """Convert a value to an array of finite numbers; ``name`` is the name of the field in error messages."""
     try:
         array = np.array(value, float)
     except (TypeError, ValueError):

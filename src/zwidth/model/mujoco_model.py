@@ -30,14 +30,14 @@ class JointSpace(NamedTuple):
 
     mass_matrix: np.ndarray  # mass matrix M with armature, shape (joints, joints), in kg m^2 or kg
     damping: np.ndarray  # viscous damping of each joint, shape (joints,), in N m s/rad or N s/m
-    jacobian: np.ndarray  # Jacobian J of the point, shape (3, joints); columns of joints without motor are zero
+    jacobian: np.ndarray  # Jacobian J of the point, shape (3, joints); 0 in the columns of joints without a motor
     stiffness: np.ndarray  # stiffness of the spring of each joint, shape (joints,), in N m/rad or N/m
 
 
 def from_mujoco(
     model: Any, site: str, direction: Any, *, pose: Any = None, rotary: bool = False
 ) -> Device | LinearDevice:
-    """Return the device that a wall along one direction at a site of a MuJoCo model acts on; see `from_mass_matrix`.
+    """Return the device of a MuJoCo model for a wall at a site along one direction; see `from_mass_matrix`.
 
     Mass matrix (with armature), Jacobian, joint damping and joint springs come from the model in the given pose. Joints
     with actuators are driven and measured, all others move passively; in a model without actuators, all joints are
@@ -82,7 +82,7 @@ def linearize_model(model: Any, site: str, pose: Any = None, *, rotary: bool = F
         model: path of a model or a ``mujoco.MjModel``.
         site: name of the site, or of the body in a model without sites.
         pose: pose of the model, in any form that `from_mujoco` accepts.
-        rotary: return the Jacobian of the rotation of the point instead of its translation.
+        rotary: True for the Jacobian of the rotation at the point, False for that of its translation.
     """
     mujoco, model = _import_mujoco(), load_model(model)
     _reject_constraints(model)
@@ -172,7 +172,7 @@ def pack_model(path: Path) -> tuple[bytes, str]:
 
 
 def _reject_constraints(model: Any) -> None:
-    """Raise `InputError` if a MuJoCo model has parts that affect its motion, but not its mass matrix."""
+    """Raise `InputError` if a MuJoCo model contains parts that matrices of the joints do not describe."""
     tendons = np.any(model.tendon_stiffness) or np.any(model.tendon_damping)
     faults = {
         "equality constraints": model.neq > 0,
@@ -219,8 +219,7 @@ def _read_position(model: Any, index: int, value: Any) -> float:
     """
     (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
     name = model.joint(int(joint)).name
-    # Accept a number that is given as text, because an array with one text contains only texts. A number without a unit
-    # is in rad or m.
+    # Accept a number as text, because NumPy converts all entries of an array to texts if one of them is a text.
     value = float(value) if isinstance(value, str) and looks_like_number(value) else value
     unit = "m" if list_joints(model).get(name) == "slide" else "rad"
     return check_number(f"pose.{name}", value, unit, ANY)

@@ -152,8 +152,8 @@ def _add_tool(
 
     gain, power, a2, a1, a0 = response
     zeta = flint.arb_poly([-1, 1])
-    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0. A tool without spring has a0 = 0. If D also
-    # has a zero at z = 1, omit the factor zeta of one of the two denominators.
+    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0; a0 is 0 for a tool without a spring.
+    # If D and the denominator of G_t share a factor zeta, omit it in one of them.
     tool = zeta * a2 + flint.arb_poly([a1]) if common else zeta * zeta * a2 + zeta * a1 + flint.arb_poly([a0])
     rest = (D // zeta if common else D) * flint.arb_poly([0] * power + [1]) * gain
     v_numerator, v_denominator = _expand_estimate(velocity)
