@@ -170,7 +170,7 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def list_tool_notes(scene: Scene) -> list[str]:
-    """Return notes on a scene with a tool: on K_max, and on other tools than the scene's; empty without a tool."""
+    """Return notes on a scene with a simulated tool: on other tools, and on K_max; an empty list without a tool."""
     if scene.tool is None:
         return []
     if scene.tool.every > 1:
@@ -292,11 +292,11 @@ def list_slopes(scene: Scene) -> list[Slope]:
     slopes, system = [], scene.unit_system
     for path, slope in per.items():
         if path not in values:
-            # Skip the dampings of joints, because their units depend on the kind of joint, which is unknown.
+            # Skip the dampings of joints, because hinges and slides have different units, and the kind is unknown.
             continue
         unit, value = system[get_unit(path)], float(slope)
-        # Choose the scale of the parameter: the period for a delay, because the delay may be 0; otherwise the magnitude
-        # of its value, because modal masses and weights of feedback may be negative.
+        # Scale the parameter by its magnitude, because modal masses and weights of feedback may be negative. Scale a
+        # delay by the period, because the delay may be 0.
         size = scene.timing.period if path == "delay" else abs(values[path])
         by_one = not size or unit == "N s/m"
         # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;

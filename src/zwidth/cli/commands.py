@@ -47,8 +47,8 @@ from zwidth.units.quantities import SIZES, Range
 
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
-# Delay in periods from which `recommend` announces a long search. Every wall of the search needs the poles of the loop,
-# whose number grows with the delay, and the time for all poles grows with the cube of their number.
+# Delay in periods from which `recommend` announces a long search. For each wall, the search computes all poles of the
+# loop. Their number grows with the delay, and the time to compute them grows with the cube of their number.
 LONG_SEARCH = 300.0
 _PACKAGE = Path(__file__).resolve().parents[1]
 # Pattern of an entry of a configuration that refers to a CSV table in the same folder.
@@ -188,7 +188,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the islands of a scene for a record; None if they are not available, with a slow simulated tool."""
+    """Return the stability islands of a scene as dicts; None for a tool with ``every`` > 1 (not available)."""
     return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
 
 
@@ -397,8 +397,8 @@ def recommend(
     The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
     Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
     --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
-    requirements; --grasps does not replace them. So --passive alone recommends the stiffest passive wall, the limit
-    that publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
+    requirements; --grasps does not replace them. With --passive only, the result is the stiffest passive wall, which
+    publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
     --friction or --max-force, the command also simulates the wall to find limit cycles and saturation; --max-force also
     limits the force in the code of --code. A hand (--operator-...) is a part of the device, and the command also checks
     the wall without this hand. The exit code is 1 if no wall exists.

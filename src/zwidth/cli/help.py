@@ -35,7 +35,7 @@ class GroupedCommand(click.Command):
     """Command whose help lists its options in groups."""
 
     def __init__(self, *args: Any, own: tuple[str, ...] = (), **settings: Any) -> None:
-        """Create the command; ``own`` are options that another command uses in another meaning, in another group."""
+        """Create the command; the help lists the options in ``own`` under "This command", not in their usual group."""
         super().__init__(*args, **settings)
         self.own = own
 
@@ -52,7 +52,7 @@ class GroupedCommand(click.Command):
 
 
 def find_group(flag: str, own: tuple[str, ...] = ()) -> str:
-    """Return the heading of the group that contains an option; options in ``own`` belong to the command itself."""
+    """Return the heading under which the help lists an option: "This command" for the options in ``own``."""
     if flag in own:
         return OWN
     for name, prefixes in GROUPS.items():

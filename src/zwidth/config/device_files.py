@@ -1,4 +1,7 @@
-"""Devices in files of their own: the value of the key ``device`` of a configuration, for the option ``--device``."""
+"""Read the device that the option ``--device`` of a command gives as a text or as the name of a file.
+
+A device file (YAML or JSON) contains the value that the key ``device`` has in a configuration.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ _SUFFIXES = (".yaml", ".yml", ".json")
 
 
 def _refuse_configuration(raw: Any) -> Any:
-    """Return the content of a file of a device unchanged; raise a problem if it is a whole configuration."""
+    """Return the content of a device file unchanged; raise an error if it is a whole configuration."""
     if isinstance(raw, dict) and "version" in raw:
         allowed = "a file for --device has the keys of one device"
         raise problem("got a whole configuration", allowed, "give its name without --device")
@@ -29,7 +32,7 @@ def _refuse_configuration(raw: Any) -> Any:
 
 
 class _DeviceFile(RootModel[Annotated[DeviceForm, BeforeValidator(_refuse_configuration)]]):
-    """A file whose content is the value of the key ``device``."""
+    """Model of a device file."""
 
 
 def read_device_option(
@@ -38,14 +41,14 @@ def read_device_option(
     """Return the device that the text of an option ``--device`` describes.
 
     Args:
-        text: the name of a YAML file with the keys of a device, such as ``mass_matrix`` or ``model``, and file names
-            relative to it; or a text that `zwidth.model.devices.read_device` accepts.
+        text: the name of a device file, in which names of other files are relative to its folder; or a text that
+            `zwidth.model.devices.read_device` accepts.
         sampled: sampling period in s for a transfer function in z; None for a transfer function in s.
-        rotary: True if a transfer function is that of a rotary device, because other options have rotary units.
+        rotary: True if other options have rotary units; a transfer function then describes a rotary device.
 
     Raises:
-        InputError: the text is none of these, or ``sampled`` is given for a device that is not a transfer function.
-        ConfigError: the file cannot be read or has faults.
+        InputError: the text describes no device, or ``sampled`` is given for a device that is not a transfer function.
+        ConfigError: the device file cannot be read or is invalid.
     """
     if text.endswith(MODEL_SUFFIXES):
         raise InputError(

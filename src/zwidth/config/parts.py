@@ -314,6 +314,6 @@ def build_parts(owner: Any) -> dict[str, Any]:
         for name, section in list_parts(owner).items()
     }
     if owner.rotary and isinstance(parts.get("device"), LinearDevice):
-        # Set the kind of the device here, because the units of the whole file determine it.
+        # Make the device rotary here, because its own section may have no rotary unit; the units of the file decide.
         parts["device"] = replace(parts["device"], rotary=True)
     return parts

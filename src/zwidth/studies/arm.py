@@ -239,9 +239,9 @@ def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
 
 
 def _draw_poses(arm: Arm, coordinates: dict[str, np.ndarray], stiffness: np.ndarray, weakest: str) -> dict[str, Any]:
-    """Return a figure of K_max over the first two joints that have several positions; empty for fewer such joints.
+    """Return a figure of K_max over the first two joints with several positions; an empty dict if fewer have them.
 
-    The figure shows the smallest K_max over all directions and over all positions of the other joints.
+    At each point, the figure shows the smallest K_max over all directions and over all positions of the other joints.
 
     Args:
         arm: the arm.

@@ -112,9 +112,9 @@ class CurvesStudy(ComputedStudy):
 
 
 def add_device_numbers(raw: dict[str, Any]) -> dict[str, Any]:
-    """Return the mapping of a study of curves, with the delta and d of its device added if they are absent.
+    """Return the mapping of a study with the delta and d of its device, unless the mapping already contains them.
 
-    For an invalid device both are 0, because the validation of the field ``device`` reports the errors.
+    If the device is invalid, delta and d are 0, because the validation of the field ``device`` reports the errors.
     """
     if "device" not in raw:
         return raw

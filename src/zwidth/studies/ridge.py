@@ -58,7 +58,7 @@ class RidgeStudy(CurvesStudy):
     kind: Literal["ridge"]
 
     device: PhysicalDevice | None = None
-    """Device in SI units whose parts, such as filters, the curves include. Default: that of the scene if it has parts
+    """Device in SI units. The curves include its parts, such as filters. Default: that of the scene, if it has parts
     and delta or d is not given."""
 
     two_scalings: bool = False
@@ -104,16 +104,16 @@ def device_ridge_table(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Compute the stiffest stable wall of a device with parts, for each combination of delta and d.
 
-    The damping of the device is that of delta, and its delay that of d; all other parameters stay the same. With parts,
-    only walls with B >= 0 are considered (`zwidth.Scene.max_stiffness`).
+    For each combination, delta determines the damping of the device and d its delay; all other parameters stay the
+    same. For a device with parts, the search excludes walls with B < 0 (`zwidth.Scene.max_stiffness`).
 
     Returns:
-        A table and notes as for `ridge_table`, with further columns of K and B in SI units.
+        A table and notes as those of `ridge_table`; the table also has columns of K and B in SI units.
     """
     scene, changed = device.to_scene(), dict[str, np.ndarray]()
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
     if delta.tolist() != [device.delta]:
-        # Subtract the damping of a rigidly coupled hand, because delta includes this damping.
+        # Subtract the damping of a rigidly coupled hand, because delta contains the damping of device and hand.
         hand = float(scene.damping - scene.device.damping)
         changed["damping"] = deltas * float(scene.units.virtual_damping) - hand
     if d.tolist() != [device.d]:
@@ -127,7 +127,7 @@ def device_ridge_table(
 
 
 def _name_kinds(codes: Any) -> np.ndarray:
-    """Return the names of the kinds of optima, from the codes of `zwidth.RidgeKind`."""
+    """Return the names of `zwidth.RidgeKind` for an array of its codes."""
     return np.array([RidgeKind(int(code)).name.lower() for code in codes])
 
 
