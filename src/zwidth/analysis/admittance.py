@@ -414,7 +414,7 @@ class AdmittanceDisplay(Part):
         return largest, self._find_frequency("stiffness", factors, largest), status
 
     def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
-        """Return the ends of the lowest interval of positive stable values of one gain, and a status.
+        """Return the ends of the lowest stable interval of one gain (1/M, D, K or B), and a status.
 
         The arguments are those of `_make_scene`.
         """

@@ -12,8 +12,8 @@ of the tool by the force. From ``e = e_0 - h f`` and ``f = K e + B (v_0 + D e)``
     e = (e_0 - h B v_0)/(1 + h (K + B D))
 
 If the scene has a position estimate or further feedback, e is computed from the position estimate of the device, and v
-is the velocity estimate of the device minus that of the tool. In the equation of e, v_0 is then the estimate of the
-device minus that of the tool for a tool at the position of the device. The force r of the feedback is added to f after
+is the velocity estimate of the device minus that of the tool. Then v_0 is the velocity estimate of the device minus
+that of a tool which is at the position of the device. The force r of the feedback is added to f after
 the step of the tool. Estimates and filters are written by `analysis.wall_code`.
 """
 
@@ -77,12 +77,12 @@ class VelocityCode(NamedTuple):
 def write_program(
     scene: SceneParts, language: str = "c", cautions: Sequence[str] = (), max_force: float = math.inf
 ) -> str:
-    """Return the source code of the wall of a scene or, if the scene has a tool, of the coupling to the tool.
+    """Return the source code of a wall or, if the scene has a tool, of the coupling between device and tool.
 
     Args:
         scene: the scene with the wall.
         language: "c" or "python".
-        cautions: sentences to include in the comment at the head.
+        cautions: sentences to include in the comment at the head of the code.
         max_force: largest force of the motor in N, to which the code limits the force on the device.
     """
     if scene.tool is None:

@@ -6,8 +6,8 @@ the closed loop divided by Y (symbols as in `zwidth.analysis.admittance_loop`),
 
     (M q_M + D q_D)/N_Y + K P + B V = 0
 
-With the matrices A and b of the robot, in sampling periods, Psi = e^A - 1, and Gamma(t), the state at the time t after
-a unit command from rest, P and V follow from the vector X (docs/theory/admittance.md, W2 and W3):
+A and b are the matrices of the robot for time in sampling periods, Psi = e^A - 1, and Gamma(t) is the state at the time
+t after a unit command from rest. P and V follow from the vector X (docs/theory/admittance.md, W2 and W3):
 
     (zeta - Psi) X = zeta Gamma(1 - f) + Gamma(1),   P = X_1/z^(n+1),   V = (A_1 X + b_1)/(T z^(n+1))
 

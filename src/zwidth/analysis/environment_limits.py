@@ -37,9 +37,9 @@ RESIDUAL = 1e-9  # largest |Im K|/|K| at a computed crossing; K is real at an ex
 NEAR_REAL = 1e-3
 # Smallest distance of a computed pole z from the unit circle, relative to |z - 1|, that exceeds its rounding error
 CLEARANCE = 1e-6
-LARGEST_DEGREE = 30  # largest degree of a characteristic polynomial whose eigenvalues are accurate roots
+LARGEST_DEGREE = 30  # largest degree of a characteristic polynomial whose roots are computed as eigenvalues
 NEGLIGIBLE = 1e-18  # coefficients of a Chebyshev series below this, relative to the largest one, are rounding errors
-TESTED = (1 / 16, 1 / 2, 15 / 16)  # fractions of the limit of K: a display must be stable at all, or unstable at all
+TESTED = (1 / 16, 1 / 2, 15 / 16)  # tested fractions of the limit: stable at all three, or unstable at all three
 # Angles w in rad per period at which `_confirm_angles` evaluates the Chebyshev series
 NODES = np.concatenate([np.geomspace(1e-6, 0.3, 120), np.linspace(0.3, np.pi - 1e-6, 121)[1:]])
 
@@ -49,7 +49,7 @@ class Limits(NamedTuple):
 
     stiffness: np.ndarray  # K in N/m
     angle: np.ndarray  # angle w in rad per period of the oscillation at K
-    status: np.ndarray  # code of OK or NO_BOUNDARY, or of UNDECIDED if another method must compute the limit
+    status: np.ndarray  # code of OK, NO_BOUNDARY, or UNDECIDED (another method must compute the limit)
 
 
 def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> Limits:
@@ -68,10 +68,10 @@ def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarra
 
 @lru_cache(KEPT_LOOPS)
 def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return two matrices with one row per polynomial: Chebyshev series of crossings, and powers of zeta = z - 1.
+    """Return the coefficients that are independent of M, D and B, as two matrices with one row per polynomial.
 
-    The rows of the first matrix are the coefficients of ``Im(p(z) p_K(1/z))/sin w`` for p = p_M, p_D and p_B. Those of
-    the second matrix are the coefficients of p_M, p_D, p_B and p_K.
+    The rows of the first matrix are the Chebyshev coefficients of ``Im(p(z) p_K(1/z))/sin w`` for p = p_M, p_D and p_B.
+    Those of the second matrix are the coefficients of p_M, p_D, p_B and p_K in powers of zeta = z - 1.
     """
     mass, damping, stiffness, environment_damping = loop.coefficients
     parts = mass, damping, environment_damping

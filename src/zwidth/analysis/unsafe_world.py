@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from zwidth.analysis.walls import Wall
 
 NODES = 800  # number of frequencies at which the condition of `is_safe_for_every_world` is evaluated
-LOWEST = 1e-4  # lowest of these frequencies, in rad per period
-MAX_FREQUENCIES = 24  # largest number of violating frequencies for which worlds are constructed
+LOWEST = 1e-4  # lowest tested frequency, in rad per period
+MAX_FREQUENCIES = 24  # largest number of frequencies, at which the condition is violated, with tested worlds
 MAX_MASSES = 6  # number of masses of the hand that are tested per frequency
-HEAVIEST = 1e4  # ratio of the largest to the smallest of these masses
+HEAVIEST = 1e4  # ratio of the largest to the smallest tested mass of the hand
 LEAST_GROWTH = 1e-13  # smallest logarithm of the spectral radius that counts as unstable, above rounding errors
 TOOL_MASSES = 1e-6, 1e9  # smallest and largest mass of the tool, relative to the mass of the device
 
@@ -75,10 +75,9 @@ def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = N
     """Return a passive tool and a passive hand with which a virtual coupling is unstable.
 
     They exist if the coupling violates the condition of `is_safe_for_every_world`. The tool is a mass M with a spring k
-    to ground. Its program integrates by the trapezoidal rule, so the tool is lossless: with the force f of the
-    coupling, the velocity v, the force s of the spring and the position y, it computes
-    ``v' = v + T/(2M) (f' - s' + f - s)``, ``s' = s + k T/2 (v' + v)`` and ``y' = y + T v'``, where f', s', v' and y'
-    are the new values. The hand is a mass and a
+    to ground. Its program integrates by the trapezoidal rule, so the tool is lossless: from the force f of the
+    coupling, the velocity v, the force s of the spring and the position y, it computes the new values
+    ``v' = v + T/(2M) (f' - s' + f - s)``, ``s' = s + k T/2 (v' + v)`` and ``y' = y + T v'``. The hand is a mass and a
     spring to ground, rigidly connected to the device. The tool and the operator of the scene have no effect.
 
     Args:
@@ -192,7 +191,7 @@ def _build_loop(world: _World, delta: float, n_delay: int) -> tuple[LoopRoots, f
     total = 1.0 + hand_mass
     body = Body(1.0, delta / total, hand_stiffness / total)
     device = factor_chain(Chain((body,), (), (), None, 0, float(n_delay), n_delay, Estimate()))
-    # With zeta = z - 1, the tool has the response z (z + 1)/(2 M zeta^2 + (k/2) (z + 1)^2).
+    # The tool has the response z (z + 1)/(2 M zeta^2 + (k/2) (z + 1)^2) from force to position, with zeta = z - 1.
     inertia, spring = 2.0 * M / total, 0.5 * k / total
     poles = -np.roots([inertia + spring, 4.0 * spring, 4.0 * spring]) if spring else np.zeros(2)
     tool = FactoredPlant(1.0 / (inertia + spring), 0, np.array([1.0, 2.0], complex), poles.astype(complex))

@@ -313,7 +313,7 @@ def find_gains(
 
 
 GAIN_NAMES: dict[str, tuple[str, ...]] = {"pid": PidGains._fields, "cascade": CascadeGains._fields}
-"""Names of the gains of each kind of controller."""
+"""Names of the gains of the two kinds of controllers, "pid" and "cascade"."""
 
 
 def find_output_unit(output_unit: float | None, torque_constant: float | None, resistance: float | None) -> float:

@@ -77,7 +77,7 @@ class JointDevice(LinearDevice):
         return f"from_mass_matrix({', '.join(f'{name}={value}' for name, value in self.spell_form().items())}{rotary})"
 
     def spell_form(self) -> dict[str, Any]:
-        """Return the value of the key ``device`` of a configuration."""
+        """Return the mapping that describes the device in a configuration, under the key ``device``."""
         joints = self._get_joints()
         matrices = {name: [list(row) for row in getattr(joints, name)] for name in joints._fields[:3]}
         # Write the vector J' n as a Jacobian with one row, which needs no direction.

@@ -51,8 +51,8 @@ class Tool(Part):
     tool in the same period, without delay, because the program also simulates the tool. The force acts on the device
     with the delay of the scene.
 
-    If the scene has a position estimate P, the coupling uses P x in place of x. If an observer or PLL
-    estimates the velocity v_x, then v_y is the backward difference of y. Further feedback acts on the device alone.
+    If the scene has a position estimate P, the coupling uses P x in place of x. If an observer or PLL estimates the
+    velocity v_x, then v_y is the backward difference of y. Further feedback acts on the device only.
 
     Args:
         mass: mass M of the tool in kg, > 0.

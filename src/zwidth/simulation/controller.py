@@ -154,14 +154,14 @@ def control(
 def _estimate_velocity(
     estimator: Estimator, positions: Array, state: Array, k: Array, newest: Array
 ) -> tuple[Array, Array]:
-    """Return a linear velocity estimate at sample k and the next state of its filter; ``newest`` is the position."""
+    """Return a linear velocity estimate at sample k and the next state of its filter. ``newest`` is the input."""
     window = estimator.window
     difference = (newest - look_back(positions, k, window)) / jnp.maximum(window, 1)
     return _filter(estimator.filter, state, jnp.where(window > 0, difference, newest))
 
 
 def _integrate_tool(step: ToolStep, tool: Array, k: Array, force: Array) -> tuple[Array, Array]:
-    """Return the state of the tool after period k, and its position from which the coupling computes its force."""
+    """Return the state of the tool after period k, and the position of the tool that determines the coupling force."""
     due = k % step.every == 0
     change = jnp.where(due, _step_freely(step, tool) + step.gain * force, 0.0)
     after = jnp.stack([tool[0] + change, jnp.where(due, change, tool[1])])

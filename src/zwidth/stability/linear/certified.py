@@ -139,8 +139,8 @@ def _add_tool(
 ) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly]:
     """Add a simulated tool to the characteristic polynomial ``D + alpha N1 + beta N2`` of a device.
 
-    The responses of the device are P H = N1/D and V H = N2/D, and those of the tool are G_t and V_t G_t, so that the
-    new characteristic polynomial is that of ``1 + alpha (P H + G_t) + beta (V H + V_t G_t)``.
+    The estimates of position and velocity of the device have the responses P H = N1/D and V H = N2/D to the force,
+    those of the tool G_t and V_t G_t. The closed loop is ``1 + alpha (P H + G_t) + beta (V H + V_t G_t) = 0``.
 
     Args:
         D, N1, N2: the polynomials of the device.

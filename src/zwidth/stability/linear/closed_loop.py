@@ -42,9 +42,9 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
 
 
 def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse) -> StateSpace:
-    """Return the state-space model from the position x of the device to its force, with a virtual coupling to a tool.
+    """Return the controller with a virtual coupling to a tool in state space, from the position x to the force.
 
-    The coupling computes ``f = alpha (P x - y) + beta (V x - V_t y)`` from x and the position y = G_t f of the tool.
+    The coupling computes ``f = alpha (P x - y) + beta (V x - V_t y)``. The tool has the position y = G_t f.
     The force is f + R x. If V belongs to no observer and is no input of R, one filter computes the relative velocity.
     """
     estimates = chain.estimates or LoopEstimates(velocity=chain.estimate)

@@ -73,11 +73,11 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
     """
     plant, F = add_plants(device, tool), device.estimate
     if estimates is None or estimates.structure == "series":
-        # Because V = P F and V_t = F, the force of the coupling is (alpha + beta F) (P x - y).
+        # With V = P F for the device and V_t = F for the tool, the coupling force is (alpha + beta F) (P x - y).
         return LoopRoots(**vars(plant), estimate=F)
     V, gain, lag = estimates.velocity, device.gain * float(F.gain), device.lag + F.lag
     if estimates.structure == "separate":
-        # Because V_t = V, the velocity part of the loop is V H + V_t G_t = V (H + G_t).
+        # The tool has the velocity estimate V_t = V, so the velocity part of the loop is V H + V_t G_t = V (H + G_t).
         # The zeros of F = V/P are first those of V, then the poles of P.
         # If V is an input of R, the poles of V are zeros of H, and cancel in V H.
         released = V.poles[: 0 if device.free_poles.size else None]
@@ -85,7 +85,7 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
         outer, second = V, tool
         first = _build_plant(gain / float(V.gain), lag - V.lag, zeros, device.poles)
     else:
-        # V_t is the backward difference (z - 1)/z. ``outer`` contains its factor 1/z, ``second`` its zero at z = 1.
+        # The tool has the velocity estimate (z - 1)/z: ``outer`` contains the factor 1/z, ``second`` the zero at z = 1.
         outer = Estimate(0, lag=1)
         first = _build_plant(gain, lag - 1, np.concatenate([device.free_zeros, F.zeros]), device.poles)
         second = replace(tool, zeros=np.append(tool.zeros, 0.0))

@@ -30,7 +30,7 @@ from zwidth.stability.linear.margins import tabulate
 
 # Angles at which Q is checked, because its zeros may be inaccurate: smallest angle, largest angle, number of angles
 TEST_ANGLES = 1e-3, 3.1, 64
-TOLERANCE = 1e-8  # largest relative difference of the two values of Q
+TOLERANCE = 1e-8  # largest relative difference between Q from its zeros and poles, and Q from its definition
 
 
 def find_coupling_delay_margin(chain: AnyChain, tool: FactoredPlant, alpha: float, beta: float) -> float:

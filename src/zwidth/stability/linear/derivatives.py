@@ -311,7 +311,7 @@ def split(value: Taylor) -> list[Taylor]:
 
 
 def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> list[Taylor]:
-    """Return alpha, beta and omega of the stiffest wall, with their derivatives in all numbers of a scene (V21)."""
+    """Return alpha, beta and omega of the stiffest wall, with derivatives (docs/theory/scenes.md, V21)."""
     is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
     free = [k for k in range(2) if is_pair[k]]
     extra = [ridge.alpha, ridge.beta, *((ridge.w1, ridge.w2)[k] for k in free)]

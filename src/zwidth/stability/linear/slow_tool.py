@@ -1,10 +1,10 @@
 """Stability of a virtual coupling to a tool that a physics engine integrates only every N sampling periods.
 
-In each period, the program computes the force f of the coupling from the distance e = x - y of device and tool. The
-engine integrates the tool by one step of length N T at the samples 0, N, 2 N, ...; between these steps the position y
-of the tool is constant. The coupling has the normalized stiffness alpha and damping beta (T = 1 and the mass m = 1). F
-is the velocity estimate with the states s, and w the *increment* of y per step (`model.tool.ToolStep`). One period
-changes the state Z = (s, device, delayed forces, w, y) as follows:
+The coupling has the normalized stiffness alpha and damping beta, and exerts the force f; w is the *increment* of the
+position y of the tool per step. In each period, the program computes f from the distance e = x - y of device and tool.
+The engine integrates the tool by one step of length N T at the samples 0, N, 2 N, ... (`model.tool.ToolStep`); between
+these steps y is constant. F is the velocity estimate with the states s. In normalized units (T = 1 and the mass m = 1),
+one period changes the state Z = (s, device, delayed forces, w, y) as follows:
 
     every period     f = alpha e + beta F e;  velocity estimate and device advance by one period with the force -f
     every N periods  w = decay w - spring y + gain f;  y = y + w
@@ -95,7 +95,7 @@ class SlowToolModel:
         Returns:
             Eigenvalues minus 1, shape (couplings, states), and logarithms, shape (couplings,). A logarithm is set to 0
             if it does not exceed the rounding error of its eigenvalue. If a monodromy matrix overflows, its eigenvalues
-            are NaN, but its logarithm is valid.
+            are NaN, but its logarithm is valid. If H or S is not finite, both are NaN.
         """
         size = len(self.drift)
         multipliers, logs = np.full((alpha.size, size), complex(np.nan)), np.full(alpha.size, np.nan)
