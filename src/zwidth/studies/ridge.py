@@ -71,6 +71,11 @@ class RidgeStudy(CurvesStudy):
         return super().fill(raw, scene)
 
     @classmethod
+    def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
+        if cls._list_absent(raw):  # with delta and d, the study does not use the scene
+            super().check_estimate(raw, scene)
+
+    @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         return add_device_numbers(raw)
 
