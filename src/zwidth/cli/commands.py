@@ -25,6 +25,7 @@ from zwidth.cli.options import (
     SHARE,
     Parsed,
     beyond_safe_option,
+    code_option,
     figure_option,
     find_omitted,
     folder_argument,
@@ -74,16 +75,20 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @hardware_options
+@code_option
 @verbose_option
 @json_option
-def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
+def check(scene: Any, hardware: dict[str, Any], code: Any, verbose: bool, as_json: bool) -> None:
     """Assess one wall: stability, margins and passivity; for an unstable wall, the changes that stabilize it.
 
     The options --stiffness, --mass (or --device) and --rate (or --period) are required; the defaults of damping and
     delay are 0. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). With
     --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and saturation.
-    The exit code is 0 for stable and for unstable walls.
+    With --code, it prints the program of a stable wall instead. The exit code is 0 for stable and for unstable walls.
     """
+    if code:
+        click.echo(scene.code(language=code, max_force=hardware.get("max_force", math.inf)), nl=False)
+        return
     from zwidth.analysis.assessment import assess, limits_of
     from zwidth.analysis.stabilization import stabilize
     from zwidth.app.verdict import format_check
@@ -378,9 +383,7 @@ _DEGREES = Parsed("DEGREES", read_degrees, "write degrees, such as 30")
 @hardware_options
 @beyond_safe_option
 @figure_option
-@click.option(
-    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
-)
+@code_option
 @verbose_option
 @json_option
 def recommend(

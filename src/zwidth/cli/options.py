@@ -372,6 +372,9 @@ figure_option = click.option(
     "--figure", type=Parsed("FILE.png", _read_figure), help="Write a figure: FILE.png, .svg or .pdf."
 )
 beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
+code_option = click.option(
+    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
+)
 verbose_option = click.option("--verbose", is_flag=True, help="Print all results.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as JSON.")
 
