@@ -286,7 +286,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return a scene changed by options (``given``: value by parameter path); parts that it lacks are added."""
+    """Return a scene with the option values in ``given``, by parameter path; parts that options set are added."""
     from zwidth.model.devices import PublishedDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}

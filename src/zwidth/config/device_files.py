@@ -25,7 +25,7 @@ _SUFFIXES = (".yaml", ".yml", ".json")
 
 
 def _refuse_configuration(raw: Any) -> Any:
-    """Return the content of a device file unchanged; raise an error if the file is a whole configuration."""
+    """Return the content of a device file unchanged; raise an error if it is a complete configuration file."""
     if isinstance(raw, dict) and "version" in raw:
         allowed = "a file for --device has the keys of one device"
         raise problem("got a whole configuration", allowed, "give its name without --device")

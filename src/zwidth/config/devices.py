@@ -197,7 +197,8 @@ def replace_rigid(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
-# `MujocoSection` is listed only for the JSON Schema, because `read_device_form` returns it as `MassMatrixSection`.
+# This union contains `MujocoSection` so that the JSON Schema describes it. `read_device_form` converts it to a
+# `MassMatrixSection`.
 DeviceForm = Annotated[_Section | MujocoSection, WrapValidator(lambda raw, _: read_device_form(raw))]
 
 
@@ -284,7 +285,7 @@ class SampledMass(OneKind):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Replace the key ``device`` by mass and damping if it names a published device or is an arm like one mass.
+        """Replace ``device`` by mass and damping for a published device, and for an arm that moves like one mass.
 
         The keys mass and damping of the section override the values of a published device.
         """

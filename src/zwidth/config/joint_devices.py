@@ -91,7 +91,7 @@ class MujocoSection(Strict, noun="a device from a MuJoCo model"):
 
     @cached_property
     def joints(self) -> dict[str, Any]:
-        """The section of the same arm with a mass matrix: the keys and values of a `MassMatrixSection`."""
+        """The same arm described by its mass matrix: keys and values of a `MassMatrixSection`."""
         matrices = linearize_model(find_file(self.model), self.site, self.pose, rotary=bool(self.rotary))
         given = {name: values.tolist() for name, values in matrices._asdict().items()}
         return {**given, "direction": self.direction, **({"rotary": True} if self.rotary else {})}
@@ -101,5 +101,5 @@ class MujocoSection(Strict, noun="a device from a MuJoCo model"):
             from_mass_matrix(**self.joints)
         except InputError as error:
             path, fault = parse_input_error(error)
-            # Report a problem that concerns no field, such as a missing package, for the whole section (empty path).
+            # Report a problem that concerns no field, such as a missing package, for the whole section: its path is ().
             yield (path if path[0] in type(self).model_fields else ()), fault

@@ -45,7 +45,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 class Joints(NamedTuple):
-    """Matrices of the joints, and the joint torques J' n for a unit force along n; tuples of values in SI units."""
+    """Matrices of the joints, and the joint torques J' n for a unit force along n; all as tuples, in SI units."""
 
     mass_matrix: tuple[tuple[float, ...], ...]
     damping: tuple[tuple[float, ...], ...]

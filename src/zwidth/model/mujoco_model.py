@@ -28,10 +28,10 @@ MODEL_SUFFIXES = (".xml", ".urdf", ".mjb")  # file name extensions of models
 class JointSpace(NamedTuple):
     """Matrices of a model in one pose; the fields are arguments of `from_mass_matrix`."""
 
-    mass_matrix: np.ndarray  # mass matrix M with armature, shape (joints, joints), in kg m^2 or kg
-    damping: np.ndarray  # viscous damping of each joint, shape (joints,), in N m s/rad or N s/m
+    mass_matrix: np.ndarray  # mass matrix M with armature inertia, shape (joints, joints), in kg m^2 or kg
+    damping: np.ndarray  # viscous damping of each joint, shape (joints,), in N m s/rad (hinges) or N s/m (slides)
     jacobian: np.ndarray  # Jacobian J of the point, shape (3, joints); 0 in the columns of joints without a motor
-    stiffness: np.ndarray  # stiffness of the spring of each joint, shape (joints,), in N m/rad or N/m
+    stiffness: np.ndarray  # stiffness of the spring of each joint, shape (joints,), in N m/rad (hinges) or N/m (slides)
 
 
 def from_mujoco(
@@ -82,7 +82,7 @@ def linearize_model(model: Any, site: str, pose: Any = None, *, rotary: bool = F
         model: path of a model or a ``mujoco.MjModel``.
         site: name of the site, or of the body in a model without sites.
         pose: pose of the model, in any form that `from_mujoco` accepts.
-        rotary: True for the Jacobian of the rotation at the point, False for that of its translation.
+        rotary: True for the Jacobian of the rotation of the site or body, False for that of its translation.
     """
     mujoco, model = _import_mujoco(), load_model(model)
     _reject_constraints(model)
@@ -154,7 +154,7 @@ def load_model(model: Any) -> Any:
 
 
 def pack_model(path: Path) -> tuple[bytes, str]:
-    """Return a self-contained copy of a model file: its content, and the suffix of its name.
+    """Return a self-contained copy of a model file: its content in bytes, and its file name extension.
 
     The content is that of the file if the model needs no other files. Otherwise, for example with meshes or included
     files, it is the compiled model in MuJoCo's binary format ".mjb", which the same release of MuJoCo can read.

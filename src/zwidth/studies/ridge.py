@@ -72,7 +72,7 @@ class RidgeStudy(CurvesStudy):
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
-        if cls._list_absent(raw):  # if delta and d are given, the study does not use the scene
+        if cls._list_absent(raw):  # otherwise delta and d are given, and the scene is unused
             super().check_estimate(raw, scene)
 
     @classmethod
