@@ -178,8 +178,9 @@ def list_tool_notes(scene: Scene) -> list[str]:
         text = f"; its tool makes one step per {every} periods, at {rate}; margins and islands are not computed"
     elif scene.tool.integrator == "semi-implicit":
         text = (
-            "; its tool is integrated by semi-implicit Euler and therefore not passive, so a coupling that is safe for "
-            "every passive world may be unstable with it; lightest_tool returns the smallest mass"
+            "; its tool is integrated by semi-implicit Euler and therefore not passive, so even a coupling that is "
+            "stable with every passive world can be unstable with this tool; Scene.lightest_tool returns the smallest "
+            "stable mass"
         )
     else:
         text = ""
