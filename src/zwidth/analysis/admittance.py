@@ -45,7 +45,7 @@ from zwidth.units.display import compact_repr
 from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE, Range
 from zwidth.units.unit_system import SYSTEMS
 
-# Units on a linear device, and allowed ranges, of the arguments of `AdmittanceDisplay.max_environment_stiffness`.
+# Unit (for a linear robot) and allowed range of each argument of `AdmittanceDisplay.max_environment_stiffness`.
 _QUANTITIES = {
     "virtual_mass": ("kg", POSITIVE),
     "virtual_damping": ("N s/m", NOT_NEGATIVE),
@@ -172,14 +172,14 @@ class AdmittanceDisplay(Part):
             self.loop.make_system()
 
     def _rebuild(self) -> AdmittanceDisplay:
-        """Return the display with all numbers checked, because JAX sets numbers unchecked."""
+        """Return a copy of the display with checks of all numbers, because JAX creates objects without these checks."""
         timing = self.timing._rebuild()
         robot = self.robot._rebuild() if isinstance(self.robot, Actuator) else self.robot
         return AdmittanceDisplay(self.virtual_mass, self.virtual_damping, robot, timing, self.command, self.integrator)
 
     @property
     def loop(self) -> AdmittanceLoop:
-        """The parts of the display that do not depend on its virtual mass and damping."""
+        """The robot and the program of the display, without the values of virtual mass and damping."""
         timing = self.timing
         return find_loop(self.robot, float(timing.period), float(timing.d), self.command, self.integrator)
 
@@ -232,16 +232,17 @@ class AdmittanceDisplay(Part):
         """Return the largest stiffness K of the environment such that the display is stable from 0 to K.
 
         The arguments are broadcast, so that one call computes K for a grid of virtual masses and dampings. Inside JAX
-        transformations, such as ``jit``, ``vmap`` and ``grad``, numbers of the display and arguments may be traced.
+        transformations, such as ``jit``, ``vmap`` and ``grad``, JAX may trace the arguments and all numbers of the
+        display.
 
         Args:
             environment_damping: damping B of the environment in N s/m, >= 0; a number or an array.
-            virtual_mass: values of M in kg, > 0, in place of that of the display.
-            virtual_damping: values of D in N s/m, >= 0, in place of that of the display.
+            virtual_mass: virtual mass M in kg, > 0, a number or an array; default: that of the display.
+            virtual_damping: virtual damping D in N s/m, >= 0, a number or an array; default: that of the display.
 
         Returns:
-            Stiffness in N/m and frequency in Hz, of the shape of the broadcast arguments. The relative error is about
-            1e-12. Entries of arrays that are out of range yield NaN and the status INVALID_INPUT.
+            `EnvironmentLimit` with arrays of the broadcast shape. The relative error of K is about 1e-12. If an entry
+            of an array is out of range, the results for this entry are NaN with the status INVALID_INPUT.
 
         Raises:
             InputError: a single number is out of range, or an argument has a wrong unit or type.
@@ -267,7 +268,7 @@ class AdmittanceDisplay(Part):
         return self._label(EnvironmentLimit(K, frequency, status))
 
     def _find_limits(self, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> EnvironmentLimit:
-        """Return the limits for arrays of one shape, as vectors."""
+        """Return the largest stable K for arrays M, D and B of equal shape; the results are one-dimensional."""
         rows = np.stack([M, D, B], -1).reshape(-1, 3)
         is_valid = np.isfinite(rows).all(-1) & (rows[:, 0] > 0) & (rows[:, 1:] >= 0).all(-1)
         limits = find_limits(self.loop, *np.where(is_valid, rows.T, [[1.0], [0.0], [0.0]]))
@@ -284,17 +285,17 @@ class AdmittanceDisplay(Part):
         return result
 
     def _trace_limit(self, given: dict[str, Any]) -> EnvironmentLimit:
-        """Return the limit for M, D and B of which JAX traces some, or for a display whose numbers it traces."""
+        """Return the largest stable K if JAX traces M, D, B or a number of the display."""
         from zwidth.analysis.traced_loop import ask
 
         units = SYSTEMS[self.rotary]
         given = {name: read_texts(name, value, units[_QUANTITIES[name][0]]) for name, value in given.items()}
-        # Replace M and D of the display by constants, so that displays with other M and D form one batch.
+        # Set M and D of the display to constants, so that displays which differ only in M and D form one batch.
         K, frequency, status = ask(self._replace(1.0, 0.0), "environment_limit", *broadcast_traced(given))
         return self._label(EnvironmentLimit(K, frequency, status.astype("int32")))
 
     def _replace(self, virtual_mass: float, virtual_damping: float) -> AdmittanceDisplay:
-        """Return the display with another virtual mass in kg and virtual damping in N s/m."""
+        """Return a copy of the display with another virtual mass (in kg) and virtual damping (in N s/m)."""
         return replace(self, virtual_mass=virtual_mass, virtual_damping=virtual_damping)
 
     def min_virtual_mass(self, hand_stiffness: Any, hand_damping: Any = 0.0) -> VirtualMassLimit:
@@ -325,7 +326,7 @@ class AdmittanceDisplay(Part):
         """Return the smallest virtual damping with which the display is stable in an environment.
 
         The virtual mass is that of the display. The virtual damping of the display has no effect on the result. With
-        dampings above ``largest`` of the result, the display may be unstable again.
+        dampings above ``largest``, a field of the result, the display may be unstable again.
 
         Args:
             environment_stiffness: K in N/m, > 0.
@@ -372,7 +373,7 @@ class AdmittanceDisplay(Part):
         return K, check_number(f"{name}_damping", damping, units["N s/m"], NOT_NEGATIVE)
 
     def _read_array(self, name: str, value: Any) -> np.ndarray:
-        """Return an argument as an array in SI units; raise `InputError` if a single number is out of range."""
+        """Return an argument as an array in SI units; raise `InputError` if it is a single number out of range."""
         unit, allowed = _QUANTITIES[name]
         unit = SYSTEMS[self.rotary][unit]
         array = as_float64(name, read_texts(name, value, unit))
@@ -406,14 +407,17 @@ class AdmittanceDisplay(Part):
         return Scene(LinearDevice(system, float(self.timing.period)), Timing(float(self.timing.period)))
 
     def _find_limit(self, factors: dict[str, float]) -> tuple[float, float, int]:
-        """Return the largest stiffness K such that all from 0 to K are stable, its frequency in Hz, and a status."""
+        """Return the largest K such that the display is stable from 0 to K, the frequency in Hz at K, and a status."""
         least, largest, status = self._find_range("stiffness", factors)
         if least > 0 or status != Status.OK:
             return np.nan, np.nan, int(Status.NO_BOUNDARY)
         return largest, self._find_frequency("stiffness", factors, largest), status
 
     def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
-        """Return both ends of the lowest stable interval of gains, and a status; arguments as `_make_scene`."""
+        """Return the ends of the lowest stable interval of one gain (1/M, D, K or B), and a status.
+
+        The arguments are those of `_make_scene`.
+        """
         intervals = self._make_scene(gain, factors).stable_stiffness(0.0)
         intervals = intervals[intervals[:, 1] > 0]
         if not intervals.size:
@@ -422,5 +426,8 @@ class AdmittanceDisplay(Part):
         return max(low, 0.0), high, int(Status.OK)
 
     def _find_frequency(self, gain: str, factors: dict[str, float], value: float) -> float:
-        """Return the frequency in Hz of the dominant pole with a value of a gain; arguments as `_make_scene`."""
+        """Return the frequency in Hz of the dominant pole if a gain has the given value.
+
+        The arguments ``gain`` and ``factors`` are those of `_make_scene`.
+        """
         return float(self._make_scene(gain, factors).dominant_pole(value, 0.0).frequency) if value == value else np.nan

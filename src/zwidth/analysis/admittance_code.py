@@ -1,8 +1,9 @@
-"""Source code of the program of an admittance display for a control loop, in C or in Python.
+"""Write the program of an admittance display, which runs in a control loop, as source code in C or in Python.
 
-From the contact force f, the program updates the velocity v and the acceleration a of the virtual mass. If it commands
-positions, it also updates the reference position x (docs/theory/admittance.md, W1). The mark ``@`` before a state is
-replaced by the notation of the language.
+An *admittance display* is a robot that measures the contact force f and moves like a virtual mass M with damping D. The
+program integrates the velocity v of this mass from f; a is its acceleration. If the command is a position, the program
+also integrates v to the commanded position x (docs/theory/admittance.md, W1). In the statements of this module, the
+mark ``@`` precedes each state; C code contains "display->" in its place, Python code "self.".
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
 
 
 def write_code(display: AdmittanceDisplay, language: str = "c") -> str:
-    """Return the source code of the program of the display: from the contact force to the command.
+    """Return the source code of the program that computes the command of the display from the contact force.
 
-    The code has the states of the virtual mass, a function that sets them to rest, and a function that is called once
-    per period.
+    The code declares the states of the program and two functions: one that initializes the states for a robot at rest,
+    and one that computes the command and must be called once per period.
 
     Args:
         language: "c" for C99, or "python".
@@ -63,7 +64,7 @@ def write_code(display: AdmittanceDisplay, language: str = "c") -> str:
 
 
 def _write_c(lines: list[str], states: list[str], update: list[str], result: str) -> str:
-    """Return the source code in C99, with a struct for the states and two functions."""
+    """Return the source code in C99: a struct for the states and two functions."""
     start = [f"@{name} = {name if name == 'x' else '0.0'}" for name in states]
     body = [f"double {line}" if line[0] in "av" else line for line in update]
     blocks = [start, [*body, f"return {result}"]]
@@ -77,7 +78,7 @@ def _write_c(lines: list[str], states: list[str], update: list[str], result: str
 
 
 def _write_python(lines: list[str], states: list[str], update: list[str], result: str) -> str:
-    """Return the source code as a Python class with the method ``command``."""
+    """Return the source code of a Python class; its method ``command`` computes the command from the force."""
     start = [f"@{name} = {name if name == 'x' else '0.0'}" for name in states]
     blocks = [start, [*update, f"return {result}"]]
     texts = ["".join(f"        {line}\n" for line in block).replace("@", "self.") for block in blocks]

@@ -1,9 +1,10 @@
-"""Characteristic polynomial of an admittance display, computed without rounding errors, and its real gains.
+"""Compute the characteristic polynomial of an admittance display in exact rational arithmetic.
 
-The display has the virtual mass M and damping D; the environment has the stiffness K and damping B. T is the sampling
-period, z = e^(sT), and ``zeta = z - 1``. The delay of the command is n + f periods, with the integer part n. Three
-responses describe the loop: Y(z) from the contact force to the command, P(z) from the command to the position of the
-robot, and V(z) from the command to the velocity of the robot. The closed loop is ``1 + Y (K P + B V) = 0`` with
+The display is a robot that measures a force and moves like a virtual mass M with damping D; the environment has the
+stiffness K and the damping B. T is the sampling period, z = e^(sT), and ``zeta = z - 1``. The delay of the command is
+n + f periods, with the integer part n. Three responses describe the loop: Y(z) from the contact force to the command,
+P(z) from the command to the position of the robot, and V(z) from the command to the velocity of the robot. The closed
+loop is ``1 + Y (K P + B V) = 0`` with
 
     Y = N_Y/(M q_M + D q_D),   P = N_P/(Q z^lag),   V = N_V/(Q z^lag)
 
@@ -31,9 +32,9 @@ from zwidth.plant.sampled_states import sample_states
 
 Command = Literal["position", "velocity"]
 Integrator = Literal["semi-implicit", "trapezoidal"]
-KEPT_LOOPS = 64  # cached loops; displays that differ only in M and D share one
+KEPT_LOOPS = 64  # number of cached loops; displays that differ only in M and D share one loop
 
-# Polynomials in zeta; the coefficient of the highest power is the first one.
+# Polynomials in zeta = z - 1, as coefficients in descending powers
 ZETA: Polynomial = (Fraction(1), Fraction(0))
 Z: Polynomial = (Fraction(1), Fraction(1))  # z = zeta + 1
 TWO: Polynomial = (Fraction(1), Fraction(2))  # z + 1 = zeta + 2
@@ -43,14 +44,14 @@ ONE: Polynomial = (Fraction(1),)
 class Coefficients(NamedTuple):
     """The four polynomials in z in the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
 
-    mass: Polynomial  # p_M, multiplied by the virtual mass M
-    damping: Polynomial  # p_D, multiplied by the virtual damping D
-    stiffness: Polynomial  # p_K, multiplied by the stiffness K of the environment
-    environment_damping: Polynomial  # p_B, multiplied by the damping B of the environment
+    mass: Polynomial  # polynomial p_M, which the virtual mass M multiplies
+    damping: Polynomial  # polynomial p_D, which the virtual damping D multiplies
+    stiffness: Polynomial  # polynomial p_K, which the stiffness K of the environment multiplies
+    environment_damping: Polynomial  # polynomial p_B, which the damping B of the environment multiplies
 
 
 class ProgramPolynomials(NamedTuple):
-    """The response ``Y = numerator/(M mass + D damping)`` of the command to the contact force, in powers of zeta."""
+    """Polynomials in zeta = z - 1 of the response ``Y = N_Y/(M q_M + D q_D)`` from contact force to command."""
 
     numerator: Polynomial  # N_Y
     mass: Polynomial  # q_M
@@ -58,19 +59,22 @@ class ProgramPolynomials(NamedTuple):
 
 
 class RobotPolynomials(NamedTuple):
-    """The responses ``P = position/(Q z^lag)`` and ``V = velocity/(Q z^lag)`` of the robot, in powers of zeta."""
+    """Polynomials in zeta = z - 1 of the responses of the robot to its command.
+
+    The response of the position is ``P = N_P/(Q z^lag)``, that of the velocity is ``V = N_V/(Q z^lag)``.
+    """
 
     position: Polynomial  # N_P
-    velocity: Polynomial  # N_V; empty for a sampled robot, because such a model does not define the velocity
+    velocity: Polynomial  # N_V; empty for a robot model in discrete time, which does not define a velocity
     denominator: Polynomial  # Q
     lag: int
 
 
 @dataclass(frozen=True)
 class AdmittanceLoop:
-    """The parts of an admittance display that do not depend on its virtual mass and damping."""
+    """The robot and the program of an admittance display, without the values of virtual mass and damping."""
 
-    robot: Any  # `Actuator` or `LinearDevice`, from the command to the motion of the robot
+    robot: Any  # `Actuator` or `LinearDevice`, the response of the robot from its command to its motion
     period: float  # T in s
     d: float  # delay in periods
     command: Command
@@ -78,12 +82,12 @@ class AdmittanceLoop:
 
     @property
     def n_delay(self) -> int:
-        """Integer part n of the delay in periods."""
+        """Integer part n of the delay of the command, in periods."""
         return int(np.floor(self.d))
 
     @cached_property
     def plant(self) -> LinearDevice:
-        """Model of the robot, from its position or velocity command to its position."""
+        """Model of the robot from its command, a position or a velocity, to its position."""
         device = self.robot
         if isinstance(device, Actuator):
             w = float(device.rate)
@@ -95,7 +99,7 @@ class AdmittanceLoop:
         return LinearDevice((numerator, (*denominator, Fraction(0))))
 
     def make_system(self) -> System:
-        """Return the plant in units of the sampling period; raise `InputError` if it cannot be sampled."""
+        """Return robot and delay in units of the sampling period; raise `InputError` if they cannot be discretized."""
         system = System(self.plant, self.period, self.period**2, self.d, self.n_delay, Estimate())
         system.check()
         return system
@@ -109,7 +113,7 @@ class AdmittanceLoop:
 
     @cached_property
     def program(self) -> ProgramPolynomials:
-        """Response Y of the command to the contact force (docs/theory/admittance.md, W4)."""
+        """Response Y from the contact force to the command (docs/theory/admittance.md, W4)."""
         period = (Fraction(self.period),)
         half = (Fraction(self.period) / 2,)
         if self.integrator == "trapezoidal":
@@ -120,12 +124,12 @@ class AdmittanceLoop:
             path = multiply(period, Z)
         if self.command == "velocity":
             return ProgramPolynomials(numerator, mass, damping)
-        # The position command integrates the virtual velocity once more, with the response path/zeta.
+        # For position commands, multiply Y by path/zeta, the integrator from the virtual velocity to the position.
         return ProgramPolynomials(multiply(numerator, path), multiply(mass, ZETA), multiply(damping, ZETA))
 
     @cached_property
     def sampled_robot(self) -> RobotPolynomials:
-        """Responses P and V, computed from the matrices Psi and Gamma of the sampled robot (W2 and W3)."""
+        """Responses P and V from command to position and velocity of the robot (docs/theory/admittance.md, W2, W3)."""
         system = self.make_system()
         if self.plant.dt:
             numerator, denominator = (to_zeta(part) for part in self.plant.system[:2])
@@ -137,9 +141,12 @@ class AdmittanceLoop:
         denominator = characteristic_polynomial(psi)
 
         def respond(output: np.ndarray) -> Polynomial:
-            """Return ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))`` for the row c = ``output``.
+            """Return the numerator of the response of ``c X``, with the state X of the robot and the row c.
 
-            Both terms follow from determinants by the matrix determinant lemma.
+            ``output`` is c. The result is ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))``. Here Psi is the
+            transition matrix of X over one period minus the identity, and Gamma(t) is the state at the time t after a
+            unit command from rest. Both terms follow from ``c adj(A) g = det(A) - det(A - g c)`` (matrix determinant
+            lemma).
             """
             first, second = (
                 subtract(denominator, characteristic_polynomial(psi + np.outer(force, output)))
@@ -149,14 +156,13 @@ class AdmittanceLoop:
 
         sensor = _to_fractions(np.eye(len(B))[0])
         velocity = add(respond(_to_fractions(A[0])), multiply((Fraction(float(B[0])),), denominator))
-        # The numerator of V is zero at z = 1 (W3). Set its constant coefficient to exactly 0, because a rounding error
-        # would separate the pole at z = 1, a drift of the position, from the zero that cancels it.
+        # Set the constant coefficient to exactly 0, so that the zero of V at z = 1 cancels the pole of the integrator.
         velocity = trim((*(value / Fraction(self.period) for value in velocity[:-1]), Fraction(0)))
         return RobotPolynomials(respond(sensor), velocity, denominator, self.n_delay + 1)
 
     @cached_property
     def coefficients(self) -> Coefficients:
-        """The polynomials p_M, p_D, p_K and p_B, computed from floats without rounding errors."""
+        """The polynomials p_M, p_D, p_K and p_B of the characteristic polynomial, with rational coefficients."""
         (position, velocity, denominator, lag), program = self.sampled_robot, self.program
         common = multiply(denominator, reduce(multiply, [Z] * lag, ONE))
         parts = (multiply(program.mass, common), multiply(program.damping, common))
@@ -165,11 +171,11 @@ class AdmittanceLoop:
 
 
 find_loop = lru_cache(KEPT_LOOPS)(AdmittanceLoop)
-"""Return the `AdmittanceLoop` with the given fields, from a cache."""
+"""Return the `AdmittanceLoop` with the given fields; the last loops are cached."""
 
 
 def _to_fractions(values: Any) -> np.ndarray:
-    """Return an array of floats as exact fractions."""
+    """Convert an array of floats to exact fractions."""
     floats = np.asarray(values, float)
     return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
 
@@ -180,17 +186,17 @@ def add(one: Polynomial, other: Polynomial) -> Polynomial:
 
 
 def to_z(polynomial: Polynomial) -> Polynomial:
-    """Return the coefficients in z of a polynomial in zeta = z - 1."""
+    """Convert a polynomial in zeta = z - 1 to powers of z."""
     return _substitute(polynomial, -1)
 
 
 def to_zeta(polynomial: Polynomial) -> Polynomial:
-    """Return the coefficients in zeta of a polynomial in z = zeta + 1."""
+    """Convert a polynomial in z to powers of zeta = z - 1."""
     return _substitute(polynomial, 1)
 
 
 def _substitute(polynomial: Polynomial, offset: int) -> Polynomial:
-    """Return the coefficients of the polynomial p(x + offset) in x, by Horner's method."""
+    """Return the coefficients of p(x + offset) in powers of x for a polynomial p, by Horner's method."""
     result: Polynomial = ()
     for value in polynomial:
         result = add(multiply(result, (Fraction(1), Fraction(offset))), (value,)) if result else trim((value,))

@@ -1,9 +1,10 @@
 """Simulate the contact of an admittance display with an environment, sample by sample.
 
-Symbols as in `zwidth.analysis.admittance_loop`: the environment has the stiffness K and the damping B, T is the
-sampling period, and the delay of the command is n + f periods. X is the state of the robot, whose first entry is the
-position, u_k the command of sample k, and Gamma(t) the state at the time t after a unit command from rest. Between two
-samples the robot moves exactly (docs/theory/admittance.md, W2):
+The display is a robot that measures the contact force and moves like a virtual mass M with damping D; the environment
+has the stiffness K and the damping B. T is the sampling period, and the delay of the command is n + f periods, with the
+integer part n. X is the state of the robot, whose first entry is the position, A the state matrix for time in sampling
+periods, u_k the command of sample k, and Gamma(t) the state at the time t after a unit command from rest. The state at
+the next sample is exact (docs/theory/admittance.md, W2):
 
     X_(k+1) = e^A X_k + Gamma(1 - f) u_(k-n) + (Gamma(1) - Gamma(1 - f)) u_(k-n-1)
 """
@@ -25,7 +26,7 @@ from zwidth.units.display import compact_repr
 if TYPE_CHECKING:
     from zwidth.analysis.admittance import AdmittanceDisplay
 
-MAX_PERIODS = 10_000_000  # largest number of simulated periods; 1.5 minutes per million
+MAX_PERIODS = 10_000_000  # largest number of simulated periods; a million periods take 1.5 minutes
 
 
 @compact_repr(time="s", position="m", velocity="m/s", force="N", virtual_velocity="m/s", command="")
@@ -34,7 +35,7 @@ class AdmittanceMotion(NamedTuple):
 
     time: np.ndarray  # k T in s
     position: np.ndarray  # position of the robot in m; 0 where the spring of the environment exerts no force
-    velocity: np.ndarray  # velocity of the robot in m/s just before the sample; NaN for a sampled robot
+    velocity: np.ndarray  # velocity of the robot in m/s just before the sample; NaN for a discrete-time model
     force: np.ndarray  # measured contact force f_k in N
     virtual_velocity: np.ndarray  # velocity of the virtual mass in m/s after the update of the program
     command: np.ndarray  # command that the program sends: position in m, or velocity in m/s
@@ -51,8 +52,8 @@ def simulate(
     """Simulate the motion of the display in contact with an environment, under the force of a hand.
 
     At the time 0 everything is at rest at the position 0. The hand then pulls the robot with a given force in the
-    direction of the position. The force sensor measures this force together with that of the environment. A stable
-    contact comes to rest at ``force/K``.
+    positive direction. The force sensor measures the sum of this force and that of the environment. With a constant
+    force, a stable contact comes to rest at ``force/K``.
 
     Args:
         environment_stiffness: K in N/m, >= 0.
@@ -101,13 +102,13 @@ def _count_periods(duration: Any, period: float) -> int:
 
 
 def _run(display: AdmittanceDisplay, K: float, B: float, forces: np.ndarray) -> list[tuple[float, ...]]:
-    """Return position, velocity, contact force, virtual velocity and command at each sample."""
+    """Return a list with position, velocity, contact force, virtual velocity and command of each sample."""
     loop, T = display.loop, float(display.timing.period)
     system = loop.make_system()
     states, (A, b, _) = sample_states(system), system.realize()
     newer = states.full if states.late is None else states.late
     older, n = states.full - newer, loop.n_delay
-    X, commands = np.zeros(len(b)), deque([0.0] * (n + 1))  # the commands u_(k-1) to u_(k-n-1), the newest first
+    X, commands = np.zeros(len(b)), deque([0.0] * (n + 1))  # commands u_(k-1) to u_(k-n-1), newest first
     step, rows = start_program(display), []
     with np.errstate(all="ignore"):
         for external in forces.tolist():
@@ -122,9 +123,10 @@ def _run(display: AdmittanceDisplay, K: float, B: float, forces: np.ndarray) -> 
 
 
 def start_program(display: AdmittanceDisplay) -> Any:
-    """Return the program of a display at rest: a function of the contact force, called once per sample.
+    """Return the program of a display as a function with internal states, which start at rest.
 
-    The function returns the virtual velocity and the command (docs/theory/admittance.md, W1).
+    The function must be called once per sample with the contact force. It returns the virtual velocity and the command
+    (docs/theory/admittance.md, W1).
     """
     T, M, D = float(display.timing.period), float(display.virtual_mass), float(display.virtual_damping)
     is_trapezoidal, sends_velocity = display.integrator == "trapezoidal", display.command == "velocity"

@@ -246,9 +246,9 @@ IMPROVEMENTS = {
     "coupling.stiffness": (2.0, "a link twice as stiff"),
     "tool.every": (0.5, "a physics engine twice as fast"),
 }
-# A lighter tool raises K_max of some scenes and lowers that of others, so only the better one of these two is listed.
+# A heavier tool increases K_max of some scenes, a lighter tool that of others; `compute_gains` omits the other one.
 TOOL_MASSES = ((2.0, "a tool twice as heavy"), (0.5, "a tool half as heavy"))
-HARMFUL_GAIN = 0.9995  # gain below which the note of a change states that it lowers the stiffness
+HARMFUL_GAIN = 0.9995  # gain below which the note of an improvement contains "harmful"
 
 
 @compact_repr()
@@ -259,7 +259,7 @@ class Limit(NamedTuple):
     label: str  # the improvement in words, such as "half the delay"
     stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
     gain: float  # ratio of that stiffness to the current one
-    # Quantity that stays constant, such as "the delay stays 1 ms", and "harmful" if the change lowers the stiffness.
+    # A quantity that stays constant, such as "the delay stays 1 ms", and "harmful" if the stiffness decreases
     note: str = ""
 
     def spell(self) -> str:
@@ -284,7 +284,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
     Each part and parameter of the scene is improved separately, by a step that is available in practice: twice the
     rate, half the delay, 10 % more damping, a filter or an amplifier twice as fast, a window half as long, a coupling
-    twice as stiff, a structure twice as stiff for the modes, a simulated tool of twice or half the mass, or a physics
+    twice as stiff, a structure (modes) twice as stiff, a simulated tool of twice or half the mass, or a physics
     engine twice as fast. At twice the rate the window keeps its length in seconds and the delay stays constant in the
     unit in which it was given; a delay given in seconds is also evaluated constant in periods. If twice the cutoff
     exceeds the Nyquist frequency, the filter is removed instead.
@@ -417,7 +417,7 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
 def _double_rate(scene: SceneOptima) -> SceneOptima:
     """Return a copy of the scene with half the sampling period.
 
-    Filter, velocity window and steps of a slow tool stay constant in seconds, the delay in the unit of its input.
+    Filter, velocity window and tool steps stay constant in seconds, the delay in the unit in which it was given.
     """
     changes: dict[str, float] = {"period": scene.timing.period / 2}
     if scene.tool is not None and scene.tool.every > 1:

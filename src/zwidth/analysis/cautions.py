@@ -172,15 +172,14 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
 
 
 def describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
-    """Return a list of texts on the safe limit: its values and reason, then its warnings.
+    """Return texts on the safe limit: one with its values and its reason, then its warnings.
 
     Args:
-        limit: the safe limit of the scene; None for none.
-        ignored: True if the recommendation ignores the limit.
-        units: unit system of the texts.
+        limit: the safe limit of the scene; None if the scene has none.
+        ignored: True if the recommended wall may exceed the limit.
+        units: units in which the texts state the limit.
     """
     if limit is None or (limit.forbids_all and not ignored):
-        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
-        # this.
+        # If the safe limit excludes all walls, the reason for the missing recommendation already states this.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]

@@ -1,8 +1,9 @@
-"""Source code of a virtual coupling and its simulated tool for a control loop, in C or in Python.
+"""Write the program of a virtual coupling and its simulated tool as source code in C or in Python.
 
-Each period, the program computes the distance e = x - y from the tool, at the position y, to the device, at the
-measured position x. It computes the velocity estimate v of e, and the force f = K e + B v of the coupling on the tool.
-It integrates the tool by one step of length T (`model.tool`), and returns -f, the force on the device.
+The *coupling* is a spring K and a damper B between the device, at the measured position x, and the *tool*, a mass at
+the position y that the program integrates by one step of length T per period (`model.tool`). In each period, the
+program computes the distance e = x - y, the estimate v of its derivative, and the force f = K e + B v of the coupling
+on the tool. It returns -f, the force on the device.
 
 If the tool is integrated by the implicit Euler method, y is its position after the step, which depends on f. Let v_0 be
 the velocity estimate for e = 0, D its direct feedthrough, e_0 the distance without the force, and h f the displacement
@@ -11,8 +12,8 @@ of the tool by the force. From ``e = e_0 - h f`` and ``f = K e + B (v_0 + D e)``
     e = (e_0 - h B v_0)/(1 + h (K + B D))
 
 If the scene has a position estimate or further feedback, e is computed from the position estimate of the device, and v
-is the velocity estimate of the device minus that of the tool. In the equation of e, v_0 is then the estimate of the
-device minus that of the tool for a tool at the position of the device. The force r of the feedback is added to f after
+is the velocity estimate of the device minus that of the tool. Then v_0 is the velocity estimate of the device minus
+that of a tool which is at the position of the device. The force r of the feedback is added to f after
 the step of the tool. Estimates and filters are written by `analysis.wall_code`.
 """
 
@@ -44,15 +45,15 @@ from zwidth.units.unit_system import UnitSystem
 
 
 class CouplingProgram(NamedTuple):
-    """Program of a coupling as statements for one language; the mark ``@`` precedes states, "# " precedes comments."""
+    """Program of a coupling as lists of statements in C or Python; "@" marks a state, "# " begins a comment."""
 
-    members: list[str]  # declarations of the states in C
-    start: list[str]  # statements that set the states to their values at rest, with the tool at the device
-    force: list[str]  # statements that compute the opposite f of the force on the device, and integrate the tool
+    members: list[str]  # declarations of the states, for C code
+    start: list[str]  # statements that initialize the states at rest, with the tool at the position of the device
+    force: list[str]  # statements that compute f (the force on the device is -f), and integrate the tool
 
 
 class DeviceCode(NamedTuple):
-    """Statements of the position and velocity estimates of the device and of the further feedback."""
+    """Statements that estimate position and velocity of the device, and compute the further feedback."""
 
     members: list[str]  # declarations of the states in C
     start: list[str]  # statements that set the states to their values at rest
@@ -61,7 +62,10 @@ class DeviceCode(NamedTuple):
 
 
 class VelocityCode(NamedTuple):
-    """Statements of the velocity estimate of the distance or, in addition to that of the device, of the tool."""
+    """Statements that estimate the velocity v of the device relative to the tool.
+
+    They estimate v from the distance e, or they subtract an estimate for the tool from that for the device.
+    """
 
     members: list[str]  # declarations of the states in C
     start: list[str]  # statements that set the states to their values at rest
@@ -73,12 +77,12 @@ class VelocityCode(NamedTuple):
 def write_program(
     scene: SceneParts, language: str = "c", cautions: Sequence[str] = (), max_force: float = math.inf
 ) -> str:
-    """Return the source code of the wall of a scene or, if the scene has a tool, of the coupling to the tool.
+    """Return the source code of a wall or, if the scene has a tool, of the coupling between device and tool.
 
     Args:
         scene: the scene with the wall.
         language: "c" or "python".
-        cautions: sentences to include in the comment at the head.
+        cautions: sentences to include in the comment at the head of the code.
         max_force: largest force of the motor in N, to which the code limits the force on the device.
     """
     if scene.tool is None:
@@ -95,7 +99,7 @@ def write_program(
 
 
 def build_coupling_program(scene: SceneParts, tool: Tool, language: str) -> CouplingProgram:
-    """Build the program of a coupling."""
+    """Build the statements of the program of a coupling to a simulated tool, in C or in Python."""
     K, B, every = float(scene.wall.stiffness), float(scene.wall.virtual_damping), tool.every
     device = write_device(scene, language)
     velocity = write_velocity(scene, language, device.position)
@@ -123,7 +127,10 @@ def build_coupling_program(scene: SceneParts, tool: Tool, language: str) -> Coup
 
 
 def write_device(scene: SceneParts, language: str) -> DeviceCode:
-    """Return the statements of the estimates of the device; none if the scene has no position estimate or feedback."""
+    """Return the statements that estimate position and velocity of the device, and compute the further feedback.
+
+    The lists are empty if the scene has neither a position estimate nor further feedback.
+    """
     if scene.position is None and scene.feedback is None:
         return DeviceCode([], [], [], "x")
     program = build_program(scene)
@@ -136,10 +143,13 @@ def write_device(scene: SceneParts, language: str) -> DeviceCode:
 
 
 def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityCode:
-    """Return the statements of the estimate of the relative velocity; ``position`` is that which the coupling uses."""
+    """Return the statements that estimate the velocity of the device relative to the tool.
+
+    ``position`` is the variable with the position of the device, "x" (measured) or "y" (estimate).
+    """
     period, estimates = float(scene.timing.period), build_estimates(scene)
-    # With a position estimate or feedback, subtract an estimate of the velocity of the tool from that of the device.
-    # Otherwise compute one estimate from the distance.
+    # Estimate the velocities of tool and device separately if the position is filtered or further feedback exists.
+    # Otherwise estimate the relative velocity from the distance between device and tool.
     prefix, newest, value, at_rest = ("tool_", "y_tool", "v_tool", "x") if estimates else ("", "e", "v", "0.0")
     estimate = estimates.of_tool if estimates else scene.velocity.estimate(period)
     count, code = estimate.window, write_filter(estimate, prefix)
@@ -148,7 +158,7 @@ def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityC
     advance = [f"@{prefix}next = (@{prefix}next + 1) % {count}"] if count > 1 else []
 
     def estimate_from(name: str, statements: list[str]) -> list[str]:
-        """Return the statements that compute the estimate from the newest value ``name``."""
+        """Return statements that estimate the velocity; the variable ``name`` contains the newest position."""
         difference = f"{name} - {past}" if count else name
         entering = f"u = ({difference}) / {count}" if count > 1 else f"u = {difference}"
         scale = f"{value} = {code.gain / period!r} * u"
@@ -172,12 +182,12 @@ def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityC
 
 
 def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityCode) -> tuple[list[str], list[str]]:
-    """Return the statements that compute the distance e, and those that integrate the tool after the force f.
+    """Return two lists of statements: the first computes the distance e, the second integrates the tool.
 
     Args:
         scene: the scene with the wall.
         tool: the tool.
-        position: name of the position of the device that the coupling uses.
+        position: name of the variable with the position of the device, "x" or "y".
         velocity: statements of the estimate of the relative velocity.
     """
     every = tool.every
@@ -186,7 +196,7 @@ def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityC
     move = f"@tool_position += {length!r} * @tool_velocity"
 
     def limit(statements: list[str]) -> list[str]:
-        """Return statements with the condition that the tool makes a step in this period."""
+        """Return statements that run only in the periods in which the tool makes a step."""
         return statements if every == 1 else ["if @sample == 0:", *(f"    {line}" for line in statements)]
 
     if tool.integrator == "semi-implicit":
@@ -198,7 +208,7 @@ def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityC
     share = 1.0 / (1.0 + damping * rate + stiffness * rate * length)
     lever = rate * length * share
     rest = "v" if position == "x" and scene.feedback is None else "v_rest"
-    # Compute v_free and e before the condition, so that both are always defined.
+    # Compute v_free and e in every period, so that both are defined also in periods without a step of the tool.
     solve = [f"e = {position} - @tool_position"] * (every > 1) + [
         "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
         f"v_free = {_join((share, '@tool_velocity'), (-share * rate * stiffness, '@tool_position'))}",
@@ -217,7 +227,7 @@ def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityC
 
 
 def _join(*terms: tuple[float, str]) -> str:
-    """Return a sum of products as an expression, without products that are 0."""
+    """Return the sum of products ``factor * name`` as an expression in source code, without products that are 0."""
     texts = [
         f"{'-' if factor < 0 else '+'} {'' if abs(factor) == 1.0 else f'{abs(factor)!r} * '}{name}"
         for factor, name in terms
@@ -227,7 +237,7 @@ def _join(*terms: tuple[float, str]) -> str:
 
 
 def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[str]:
-    """Return lines of comment: the coupling and the limit of its force, the tool, the estimate and the feedback."""
+    """Return comment lines for the source code: coupling, largest force, tool, position estimate and feedback."""
     system, wall = scene.unit_system, scene.wall
     coupling = format_wall(float(wall.stiffness), float(wall.virtual_damping), system)
     estimator = type(scene.position if has_velocity(scene.position) else scene.velocity).__name__
@@ -251,7 +261,7 @@ def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[
 
 
 def _describe_call(system: UnitSystem) -> list[str]:
-    """Return the lines of comment on the argument and the result of the generated function, and on the tool."""
+    """Return comment lines on the argument and the result of the generated function, and on the tool."""
     position, force, unit = ("angle", "torque", "rad") if system.rotary else ("position", "force", "m")
     return [
         f"x is the {position} of the device in {unit}; the result is the {force} on the device in {system['N']}.",

@@ -1,9 +1,9 @@
-"""Stability of the virtual coupling between a device and a simulated tool, a spring alpha and a damper beta.
+"""Stability of a virtual coupling, a spring alpha and a damper beta between a device and a simulated tool.
 
-alpha and beta are normalized. With the responses G of the device and G_t of the tool, and the velocity estimate F, the
-closed loop is ``1 + (alpha + beta F) (G + G_t) = 0`` (docs/theory/passivity.md, U5). The analyses of `LinearLoop` for a
-wall are therefore valid for the coupling, with G + G_t in place of G. A position estimate and further feedback of the
-device change G and F (`stability.linear.composition`).
+alpha and beta are normalized. G is the response of the device from force to position, G_t that of the tool, and F the
+velocity estimate. The closed loop is ``1 + (alpha + beta F) (G + G_t) = 0`` (docs/theory/passivity.md, U5). The
+analyses of `LinearLoop` for a wall are therefore valid for the coupling, with G + G_t in place of G. A position
+estimate and further feedback of the device change G and F (`stability.linear.composition`).
 
 A tool that is integrated by the implicit Euler method responds to the coupling force without delay. The set of stable
 couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable, or couplings with large alpha
@@ -45,12 +45,12 @@ class CouplingLoop(LinearLoop):
         return self._add_tool(super().roots)
 
     def _add_tool(self, device: LoopRoots) -> LoopRoots:
-        """Return the loop of the coupling, from the loop of the device without a tool."""
+        """Return the loop of the coupling for the given loop of the device without a tool."""
         return compose_coupling(device, self.chain.estimates, self._factored_tool)
 
     @cached_property
     def _factored_tool(self) -> FactoredPlant:
-        """Response G_t of the tool."""
+        """Response G_t of the tool from force to position."""
         return factor_tool(self.scene.tool.respond(self.scene.mass, self.scene.timing.period))
 
     @cached_property
@@ -67,21 +67,21 @@ class CouplingLoop(LinearLoop):
         loop = self.roots
         if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:
             return np.empty((0, 2))
-        # For alpha = r beta and beta -> inf, the poles approach the zeros of r + F, because all zeros of G are poles of
-        # F. They are the poles of the loop of a spring r with the plant 1/F.
+        # For alpha = r beta and beta -> inf, the poles of the loop approach the zeros of r + F.
+        # The zeros of r + F are the poles of a loop with the plant 1/F and a spring of stiffness r.
         intervals = find_stable_intervals(Boundary.trace(loop.invert_estimate()), np.zeros(1))
         return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     @cached_property
     def unbounded(self) -> bool:
-        """True if couplings with arbitrarily large alpha or beta are stable."""
+        """True if some couplings with arbitrarily large alpha or beta are stable."""
         return self.has_free_stiffness or bool(self.stable_ratios.size)
 
     @cached_property
     def free_damping(self) -> float:
         """The smallest beta in `TESTED_DAMPINGS` with which the coupling is stable for every alpha > 0; NaN if none is.
 
-        It is NaN, too, if not all couplings with sufficiently large alpha are stable.
+        The value is also NaN if `has_free_stiffness` is False.
         """
         if not self.has_free_stiffness:
             return np.nan
@@ -106,7 +106,7 @@ class CouplingLoop(LinearLoop):
             return super().stiffest(negative)
         low, high = self.stable_ratios.T
         if ((low <= 0) & (high > 0)).any():
-            # With a sufficiently large beta, couplings of every alpha from 0 on are stable.
+            # Every alpha > 0 is stable with a sufficiently large beta.
             unlimited, nan = np.float64(np.inf), np.float64(np.nan)
             return RidgePoint(unlimited, unlimited, nan, np.int32(RidgeKind.NONE), np.int32(Status.OK))
         beta = np.float64(self.free_damping)
@@ -117,8 +117,8 @@ class CouplingLoop(LinearLoop):
     def is_connected(self, alpha: float, beta: float) -> bool:
         if not self.unbounded:
             return super().is_connected(alpha, beta)
-        # If all couplings with sufficiently large alpha are stable, whatever their beta, they are connected to each
-        # other. If one beta is stable for every alpha > 0, they are also connected to alpha = 0.
+        # All stable couplings with very large alpha are connected to each other.
+        # They are connected to alpha = 0 if one beta is stable for every alpha > 0.
         intervals = find_stable_intervals(self.boundary, np.array([beta]))
         inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
         from_zero = intervals.low[0] <= CONNECTED_START * alpha

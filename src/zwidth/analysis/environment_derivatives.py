@@ -1,12 +1,13 @@
-"""Compute the largest stable stiffness of the environment of an admittance display, with exact derivatives, in NumPy.
+"""Compute the largest stable environment stiffness of an admittance display, with exact derivatives.
 
-Symbols as in `zwidth.analysis.admittance_loop`; w is the angle of the pole on the unit circle, in rad per period, and
-``z = e^(jw)``. The limit K and the angle w solve the closed loop divided by Y,
+The display has the virtual mass M and damping D; the environment has the stiffness K and the damping B. At the largest
+stable K, the *limit*, a pole is on the unit circle at ``z = e^(jw)``, with the angle w in rad per period. K and w solve
+the closed loop divided by Y (symbols as in `zwidth.analysis.admittance_loop`),
 
     (M q_M + D q_D)/N_Y + K P + B V = 0
 
-With the matrices A and b of the robot, in sampling periods, Psi = e^A - 1, and Gamma(t), the state at the time t after
-a unit command from rest, P and V follow from the vector X (docs/theory/admittance.md, W2 and W3):
+A and b are the matrices of the robot for time in sampling periods, Psi = e^A - 1, and Gamma(t) is the state at the time
+t after a unit command from rest. P and V follow from the vector X (docs/theory/admittance.md, W2 and W3):
 
     (zeta - Psi) X = zeta Gamma(1 - f) + Gamma(1),   P = X_1/z^(n+1),   V = (A_1 X + b_1)/(T z^(n+1))
 
@@ -31,15 +32,16 @@ NYQUIST_TOLERANCE = 1e-12  # relative distance of the angle w from pi below whic
 
 
 def find_environment_limits(display: Any, points: np.ndarray, order: int) -> list[np.ndarray]:
-    """Return stiffness, frequency and status of limits, with derivatives in the leaves of the display and in M, D, B.
+    """Return limit K, frequency and status, with derivatives with respect to the numbers of the display and M, D, B.
 
     Args:
         display: a display, whose own virtual mass and damping have no effect.
-        points: values of M, D and B, one row per point.
+        points: one row (M, D, B) per result.
         order: order of the highest derivative, 0, 1 or 2.
 
     Returns:
-        Values of shape (points, 3), and derivatives with one or two further axes for the variables.
+        Values (K, frequency, status) of shape (points, 3). Derivatives have one or two further axes for the variables:
+        the numbers of the display, then M, D and B.
     """
     M, D, B = points.T
     limit = display.max_environment_stiffness(B, virtual_mass=M, virtual_damping=D)
@@ -61,11 +63,11 @@ def find_environment_limits(display: Any, points: np.ndarray, order: int) -> lis
 
 
 def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float], list[Taylor]]:
-    """Return a function of M, D and B (a list), K and w, which returns stiffness and frequency with derivatives.
+    """Return a function of the list [M, D, B], K and w, which returns K and its frequency in Hz, with derivatives.
 
-    At an integer delay, the response of some robots has a kink. The derivative in the delay is then that of longer
-    delays. For a delay in seconds, the derivative in the period is that of longer periods. A sampled robot is valid for
-    one period and one delay only, so that its derivatives in both are NaN.
+    At an integer delay, K of some robots has a kink as a function of the delay. The derivative with respect to the
+    delay is then right-sided; if the delay is given in seconds, so is the derivative with respect to the period. A
+    robot model in discrete time is valid for one period and one delay only, so its derivatives in both are NaN.
     """
     loop, count = display.loop, len(list_leaves(display))
     n = loop.n_delay
@@ -87,26 +89,26 @@ def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float]
 
 
 class LimitTerms:
-    """Taylor expansions of the sampled robot in all variables: the leaves of a display, M, D, B, K and w."""
+    """Taylor expansions of the discretized robot in all variables: the numbers of the display, M, D, B, K and w."""
 
     def __init__(self, display: Any, order: int, n: int) -> None:
         """Discretize the robot; ``order`` is 1 or 2, and ``n`` the integer part of the delay in periods."""
         self.loop, self.n = display.loop, n
         leaves = list_leaves(display)
-        # The robot does not depend on the last five variables, so that any values serve for them.
+        # Set the last five variables (M, D, B, K, w) to 1, because the robot does not depend on their values.
         self.variables = seed([*leaves, *[1.0] * 5], order)
         self.count, self.one = len(leaves), self.variables[0] * 0.0 + 1.0
         self.varied = replace_leaves(display, iter(self.variables))
         timing = self.varied.timing
         self.period = timing.period
         d = timing._periods if timing.in_periods else timing.delay / timing.period
-        # Use the value of d of the loop, because the quotient has a rounding error, which `Timing.d` removes.
+        # Use the delay in periods of the loop, because delay/period has a rounding error, which `Timing.d` removes.
         fraction = Taylor(np.float64(self.loop.d), d.first, d.second) - n
         self.A, self.b = self._realize()
         self.states = StateTerms(self.A, self.b, self.one, fraction, bool(self.loop.plant.dt))
 
     def differentiate(self, factors: list[float], K: float, w: float) -> list[Taylor]:
-        """Return stiffness and frequency, with derivatives in the leaves of the display, followed by M, D and B.
+        """Return the limit K and its frequency in Hz, with derivatives in the numbers of the display and M, D, B.
 
         Args:
             factors: values of M, D and B.
@@ -119,7 +121,7 @@ class LimitTerms:
             for value, variable in zip(values, self.variables[self.count :], strict=True)
         )
         residual = self._evaluate((M, D, B, stiffness), angle * 1j) * (1.0 / K)
-        # At the Nyquist frequency, the residual is real, and the angle is constant.
+        # At the Nyquist frequency, the residual is real; replace its imaginary part by the equation w = pi.
         is_nyquist = w > np.pi * (1.0 - NYQUIST_TOLERANCE)
         equations = [residual.real, angle - np.pi if is_nyquist else residual.imag]
         limit, angle = differentiate_implicitly(equations, [K, w])
@@ -128,11 +130,14 @@ class LimitTerms:
         return [limit, angle / (period * (2.0 * np.pi))]
 
     def _evaluate(self, factors: tuple[Taylor, ...], lam: Taylor) -> Taylor:
-        """Return ``(M q_M + D q_D)/N_Y + K P + B V`` at ``z = e^lam``; ``factors`` are M, D, B and K."""
+        """Return the closed loop divided by Y, ``(M q_M + D q_D)/N_Y + K P + B V``, at ``z = e^lam``.
+
+        ``factors`` are M, D, B and K.
+        """
         M, D, B, K = factors
         z, zeta, T = lam.exp(), lam.expm1(), self.period
-        # With the semi-implicit method, v/f = T z/(M zeta + T D). With the trapezoidal method, T is multiplied by
-        # ``half``, and M zeta by z (W1).
+        # The semi-implicit method computes the virtual velocity v = T z/(M zeta + T D) f from the force f.
+        # The trapezoidal method has the same response with T multiplied by ``half``, and M zeta by z (W1).
         half, mass, path = self.one, zeta, z
         if self.loop.integrator == "trapezoidal":
             half = (z + 1.0) * 0.5
@@ -144,7 +149,7 @@ class LimitTerms:
         return inverse + (K * position + B * velocity) * (lam * -(self.n + 1)).exp()
 
     def _respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
-        """Return ``X_1`` and ``(A_1 X + b_1)/T`` of the robot."""
+        """Return the responses ``X_1`` (position) and ``(A_1 X + b_1)/T`` (velocity) of the robot, without delay."""
         state = self.states.respond(zeta)[1]
         velocity = self.b[0]
         for k in range(len(self.b.v)):
@@ -152,11 +157,11 @@ class LimitTerms:
         return state[0], velocity / self.period
 
     def _realize(self) -> tuple[Taylor, Taylor]:
-        """Return the matrices A and b of the robot in units of the sampling period; the first state is the position."""
+        """Return the matrices A and b of the robot, for time in periods, with the position as the first state."""
         T, robot, loop = self.period, self.varied.robot, self.loop
         if not isinstance(robot, Actuator):
             A, b = (stack(part, self.one) for part in loop.make_system().realize()[:2])
-            # The entries of both matrices are proportional to the period.
+            # Both matrices of a robot in continuous time are proportional to the sampling period T.
             factor = self.one if loop.plant.dt else T / loop.period
             return tuple(
                 part * factor.map(lambda v, part=part: np.asarray(v)[(None,) * part.v.ndim]) for part in (A, b)
@@ -166,7 +171,7 @@ class LimitTerms:
         rows = [[0.0, 1.0], last] if robot.order == 2 else [last]
         force = [*[0.0] * (robot.order - 1), rate**robot.order]
         if loop.command == "velocity":
-            # A further first state integrates the velocity of the robot, which is the state after it.
+            # Insert the position as first state; its derivative is the velocity, which becomes the second state.
             rows = [[0.0, T, *[0.0] * (robot.order - 1)], *([0.0, *row] for row in rows)]
             force = [0.0, *force]
         return stack(rows, self.one), stack(force, self.one)

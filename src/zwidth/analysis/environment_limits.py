@@ -1,7 +1,7 @@
-"""Compute the largest stable stiffness of the environment for many virtual masses and dampings at once.
+"""Compute the largest stable environment stiffness of admittance displays, for many displays at once.
 
-Symbols as in `zwidth.analysis.admittance_loop`: the display has the virtual mass M and damping D, the environment the
-stiffness K and the damping B, and the characteristic polynomial is ``M p_M + D p_D + K p_K + B p_B``. With
+A display has the virtual mass M and damping D; the environment has the stiffness K and the damping B. The
+characteristic polynomial is ``M p_M + D p_D + K p_K + B p_B`` (`zwidth.analysis.admittance_loop`). With
 ``z = e^(jw)`` and u_M = -p_M/p_K, u_D = -p_D/p_K, u_B = -p_B/p_K, a pole is at the angle w on the unit circle if
 
     K = M u_M(w) + D u_D(w) + B u_B(w)
@@ -29,29 +29,31 @@ from zwidth.core.status import Status
 from zwidth.model.exact_polynomials import Polynomial
 from zwidth.numerics.polynomials import companion
 
-BLOCK = 4096  # displays per call of the eigenvalue solver; bounds the memory
+BLOCK = 4096  # largest number of displays per call of the eigenvalue solver; bounds the memory
 NEWTON_STEPS = 8  # Newton steps for the angle of a crossing; 3 suffice after the eigenvalue solver
-STEP = 1e-5  # relative step of w for the derivative in Newton's method
-RESIDUAL = 1e-9  # largest imaginary part of K at a crossing, relative to K
-NEAR_REAL = 1e-3  # imaginary part of x, relative to the distance from 1 or -1, below which a crossing is ambiguous
-CLEARANCE = 1e-6  # distance of a pole from the unit circle, relative to |zeta|, above which its eigenvalue is accurate
-LARGEST_DEGREE = 30  # degree of the characteristic polynomial up to which eigenvalues are accurate
-NEGLIGIBLE = 1e-18  # coefficient of the Chebyshev series, relative to the largest one, that rounding errors exceed
-TESTED = (1 / 16, 1 / 2, 15 / 16)  # fractions of the smallest positive K at which the stability must be the same
-# Angles between which the number of crossings is compared with the signs of the Chebyshev series, in rad per period.
+STEP = 1e-5  # relative step of the angle w for the numerical derivative in Newton's method
+RESIDUAL = 1e-9  # largest |Im K|/|K| at a computed crossing; K is real at an exact crossing
+# Imaginary part of a root x = cos w, relative to its distance from 1 or -1, below which it is unclear whether x is real
+NEAR_REAL = 1e-3
+# Smallest distance of a computed pole z from the unit circle, relative to |z - 1|, that exceeds its rounding error
+CLEARANCE = 1e-6
+LARGEST_DEGREE = 30  # largest degree of a characteristic polynomial whose roots are computed as eigenvalues
+NEGLIGIBLE = 1e-18  # coefficients of a Chebyshev series below this, relative to the largest one, are rounding errors
+TESTED = (1 / 16, 1 / 2, 15 / 16)  # tested fractions of the limit: stable at all three, or unstable at all three
+# Angles w in rad per period at which `_confirm_angles` evaluates the Chebyshev series
 NODES = np.concatenate([np.geomspace(1e-6, 0.3, 120), np.linspace(0.3, np.pi - 1e-6, 121)[1:]])
 
 
 class Limits(NamedTuple):
-    """Limits of many displays, as arrays of one shape; NaN without limit."""
+    """Largest stable environment stiffness K of many displays, as arrays of equal shape; NaN without a stable K."""
 
     stiffness: np.ndarray  # K in N/m
     angle: np.ndarray  # angle w in rad per period of the oscillation at K
-    status: np.ndarray  # code of OK or NO_BOUNDARY, or of UNDECIDED if another method must compute the limit
+    status: np.ndarray  # code of OK, NO_BOUNDARY, or UNDECIDED (another method must compute the limit)
 
 
 def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> Limits:
-    """Return the largest K such that displays are stable from 0 to K; M, D and B are vectors of one length."""
+    """Return the largest K such that a display is stable from 0 to K, for each entry of the vectors M, D and B."""
     if len(loop.coefficients.mass) > LARGEST_DEGREE + 1:
         unknown = np.full(len(M), np.nan)
         return Limits(unknown, unknown.copy(), np.full(len(M), int(Status.UNDECIDED)))
@@ -66,7 +68,11 @@ def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarra
 
 @lru_cache(KEPT_LOOPS)
 def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Chebyshev series of the crossings for M, D and B, and p_M, p_D, p_B and p_K in powers of zeta."""
+    """Return the coefficients that are independent of M, D and B, as two matrices with one row per polynomial.
+
+    The rows of the first matrix are the Chebyshev coefficients of ``Im(p(z) p_K(1/z))/sin w`` for p = p_M, p_D and p_B.
+    Those of the second matrix are the coefficients of p_M, p_D, p_B and p_K in powers of zeta = z - 1.
+    """
     mass, damping, stiffness, environment_damping = loop.coefficients
     parts = mass, damping, environment_damping
     series = _stack([_expand_crossings(part, stiffness) for part in parts], at_end=True)
@@ -74,7 +80,7 @@ def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarray, factors: np.ndarray) -> Limits:
-    """Return the limits of displays; ``factors`` has a row (M, D, B) per display."""
+    """Return the limits of one block of displays: ``factors`` has one row (M, D, B) per display."""
     coefficients = factors @ series
     with np.errstate(all="ignore"):
         angles, is_ambiguous = _find_angles(coefficients)
@@ -95,12 +101,12 @@ def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarra
 
 
 def _confirm_angles(coefficients: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Return whether the number of crossings between neighboring nodes agrees with the signs of the Chebyshev series.
+    """Return True for each display whose crossings agree with the signs of the Chebyshev series at the nodes.
 
-    The number must be odd if and only if the sign changes. Eigenvalues may miss roots, or yield wrong ones, if the
-    coefficients differ by many orders of magnitude.
+    Between neighboring nodes, the number of crossings must be odd if and only if the sign changes. The check is needed,
+    because eigenvalues may miss crossings if the coefficients of the series differ by many orders of magnitude.
     """
-    # Each series times sin w is a sum of sin((k + 1) w), and sin w is positive.
+    # Evaluate the series times sin w, which is a sum of sin((k + 1) w); sin w > 0 does not change the sign.
     values = coefficients @ np.sin(np.outer(np.arange(1, coefficients.shape[1] + 1), NODES))
     changes = np.signbit(values[:, 1:]) != np.signbit(values[:, :-1])
     between = (angles[:, :, None] > NODES[:-1]) & (angles[:, :, None] <= NODES[1:])
@@ -108,37 +114,38 @@ def _confirm_angles(coefficients: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def _expand_crossings(p: Polynomial, p_K: Polynomial) -> np.ndarray:
-    """Return the coefficients of U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``, for z = e^(jw)."""
+    """Return the coefficients of the Chebyshev polynomials U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``."""
     ascending, other = p[::-1], p_K[::-1]
     size = max(len(ascending), len(other), 1)
     sums = [Fraction(0)] * size
     for i, a in enumerate(ascending):
         for j, b in enumerate(other):
-            # The imaginary part of z^(i - j) is sin((i - j) w) = sin w U_(i - j - 1)(cos w).
+            # For z = e^(jw), the imaginary part of z^(i - j) is sin((i - j) w) = sin w U_(i - j - 1)(cos w).
             if i != j:
                 sums[abs(i - j) - 1] += a * b if i > j else -a * b
     return np.array(sums, float)
 
 
 def _stack(rows: list[np.ndarray], *, at_end: bool) -> np.ndarray:
-    """Return rows of different lengths as a matrix, with zeros before the entries or, with ``at_end``, after them."""
+    """Return a matrix of rows that are padded with zeros, after the entries if ``at_end`` is True, else before them."""
     size = max(map(len, rows))
     return np.array([np.pad(row, (0, size - len(row)) if at_end else (size - len(row), 0)) for row in rows])
 
 
 def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the angles of the crossings, NaN in unused places, and whether the number of crossings is ambiguous.
+    """Return the angles w of the crossings of each display, padded with NaN, and True if their number is unclear.
 
     Args:
-        series: coefficients of U_0, U_1, ..., one row per display.
+        series: coefficients of the Chebyshev polynomials U_0, U_1, ..., one row per display.
     """
-    # Omit negligible coefficients of the highest order, because the colleague matrix is divided by the last one.
+    # Omit negligible coefficients of the highest orders, because the last coefficient is a divisor below.
     size = np.abs(series)
     used = np.flatnonzero((size > NEGLIGIBLE * size.max(-1, keepdims=True)).any(0))
     series = series[:, : used[-1] + 1] if used.size else series[:, :1]
     count, top = series.shape[1] - 1, series[:, -1:]
     is_invalid = (top[:, 0] == 0) | ~np.isfinite(series).all(-1)
-    # Rows of the colleague matrix: x U_k = (U_(k+1) + U_(k-1))/2, where the last U_k is eliminated by the series.
+    # Build the colleague matrix, whose eigenvalues are the roots x, from x U_k = (U_(k+1) + U_(k-1))/2 in row k.
+    # In the last row, use the series to eliminate U_(k+1).
     matrix = np.zeros((len(series), count, count))
     matrix += (np.eye(count, k=1) + np.eye(count, k=-1)) / 2.0
     if count:
@@ -151,7 +158,10 @@ def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _evaluate(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> Any:
-    """Return ``M u_M + D u_D + B u_B`` at angles; ``factors`` has a row (M, D, B) per row of ``angles``."""
+    """Return the complex stiffness ``K = M u_M + D u_D + B u_B`` with which a pole is at e^(jw), for angles w.
+
+    ``factors`` has a row (M, D, B) per row of ``angles``.
+    """
     zeta = np.expm1(1j * angles)
     robot, program = loop.sampled_robot, loop.program
 
@@ -165,7 +175,7 @@ def _evaluate(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> 
 
 
 def _refine(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Return the angles of crossings after Newton steps for the imaginary part of K."""
+    """Refine the angles of crossings by Newton's method, so that the imaginary part of K becomes 0."""
     for _ in range(NEWTON_STEPS):
         low, high = angles * (1.0 - STEP), angles * (1.0 + STEP)
         slope = (_evaluate(loop, factors, high) - _evaluate(loop, factors, low)).imag / (high - low)
@@ -174,7 +184,7 @@ def _refine(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> np
 
 
 def _label_poles(polynomials: np.ndarray, factors: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Return 1 for stable and -1 for unstable displays, and 0 if a pole is too close to the unit circle.
+    """Return 1 for stable displays, -1 for unstable ones, and 0 if a pole is too close to the unit circle to decide.
 
     Args:
         polynomials: coefficients of p_M, p_D, p_B and p_K, in powers of zeta.
@@ -184,7 +194,7 @@ def _label_poles(polynomials: np.ndarray, factors: np.ndarray, K: np.ndarray) ->
     monic = np.concatenate([factors, K[:, None]], -1) @ polynomials
     monic = monic / monic[:, :1]
     is_valid: Any = np.isfinite(monic).all(-1)
-    # Slow poles are a cluster near z = 1. In powers of zeta, their eigenvalues have small relative errors.
+    # Compute zeta = z - 1 of the poles z, because eigenvalues near 0 are more accurate than eigenvalues near 1.
     zeta: Any = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
     excess, bound = 2.0 * zeta.real + np.abs(zeta) ** 2, CLEARANCE * np.abs(zeta)  # excess is |z|^2 - 1
     is_stable, is_unstable = (excess < -bound).all(-1), (excess > bound).any(-1)

@@ -15,19 +15,19 @@ import numpy as np
 
 from zwidth.analysis.base import SceneParts
 
-# Frequencies relative to the Nyquist frequency, at which sign changes of Im x are searched: equal ratios for slow poles
-# of integrators, and equal steps for resonances.
+# Frequencies, relative to the Nyquist frequency, between which the search looks for sign changes of Im x.
+# The geometric part resolves the slow poles of integrators, the linear part resolves resonances.
 GRID = np.unique(np.concatenate([np.geomspace(1e-7, 1.0, 4001), np.linspace(1e-4, 1.0, 8001)]))
-SPLITS = 33  # frequencies per bracket and refinement
-REFINEMENTS = 9  # a factor of 32 each, 3e-14 in all
+SPLITS = 33  # frequencies per bracket in each refinement
+REFINEMENTS = 9  # number of refinements; each divides the width of a bracket by 32
 
 
 def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, float]:
-    """Return the ends of the interval of stable values around a stable gain, with all other gains unchanged.
+    """Return the ends of the interval of stable values of one gain, with all other gains of the controller unchanged.
 
     Args:
-        make: function that returns the `zwidth.Scene` of the controller with a value of the gain.
-        gain: value of the gain, > 0, with which the controller is stable.
+        make: function that returns the `zwidth.Scene` of the controller for a value of this gain.
+        gain: a stable value of the gain, > 0, which the interval contains.
 
     Returns:
         Lower end, at least 0, and upper end; infinity if every larger gain is stable.
@@ -36,7 +36,7 @@ def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, 
     nyquist = 0.5 / float(given.timing.period)
 
     def evaluate(frequency: np.ndarray) -> Any:
-        """Return x = -(1 + L_0)/L_1 relative to the gain, at frequencies relative to the Nyquist frequency."""
+        """Return x = -(1 + L_0)/L_1, relative to ``gain``, at frequencies relative to the Nyquist frequency."""
         base = _open_loop(without, frequency * nyquist)
         with np.errstate(all="ignore"):
             return -(1.0 + base) / (_open_loop(given, frequency * nyquist) - base)
@@ -51,15 +51,15 @@ def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, 
         last = SPLITS - 2 - np.argmax(kept[:, ::-1], axis=1)
         rows = np.arange(index.size)
         low, high = points[rows, last], points[rows, last + 1]
-    # At the Nyquist frequency, z = -1 and x is always real.
+    # The last value is also critical, because x is real at the Nyquist frequency, z = -1.
     roots = [evaluate(0.5 * (low + high)).real] if index.size else []
     critical = np.concatenate([*roots, values[-1:].real])
-    # Exclude sign changes at poles of x, where |x| is infinite.
+    # Exclude sign changes of Im x at poles of x, where |x| is infinite.
     critical = critical[np.isfinite(critical) & (critical > 0) & (critical < 1e9)]
     below, above = critical[critical <= 1.0], critical[critical > 1.0]
     return gain * float(below.max(initial=0.0)), gain * float(above.min(initial=math.inf))
 
 
 def _open_loop(scene: SceneParts, frequency: np.ndarray) -> np.ndarray:
-    """Return the open loop of a scene with its wall and its further feedback, at frequencies in Hz."""
+    """Return the open loop L of a scene with its wall and further feedback, at frequencies in Hz."""
     return np.asarray(scene.frequency_response(frequency=frequency))  # pyright: ignore[reportAttributeAccessIssue]

@@ -18,15 +18,15 @@ from zwidth.core.status import Status
 from zwidth.model.joint_space import JointDevice
 from zwidth.stability.linear.derivatives import CENTRAL_DIFFERENCE, SceneSensitivities
 
-# Largest step of D: relative to D, and relative to M/T, the damping that stops the joint within about one period.
+# Largest step of D, relative to D and relative to M/T. A joint with the damping M/T stops within about one period.
 RELATIVE_STEP, SCALED_STEP = 1e-2, 1e-3
-SMALLEST_STEP = 1e-6  # step relative to M/T below which the differences of K_max consist of rounding errors
-# Pairs of offset (in steps) and weight of a forward difference of third order, for a damping of about zero.
+SMALLEST_STEP = 1e-6  # step, relative to M/T, below which differences of K_max are mostly rounding errors
+# Pairs of offset (in steps) and weight of a forward difference of third order, used if D is about zero
 FORWARD_DIFFERENCE = [(0, -11 / 6), (1, 3.0), (2, -3 / 2), (3, 1 / 3)]
 
 
 def add_joint_dampings(scene: Any, result: SceneSensitivities, measure: Callable[[Any], float]) -> SceneSensitivities:
-    """Return sensitivities with the derivatives of K_max with respect to the dampings of joints added.
+    """Add the derivatives of K_max with respect to the joint dampings to the sensitivities of a scene.
 
     Args:
         scene: the scene; the result is unchanged unless its device is a `JointDevice`.

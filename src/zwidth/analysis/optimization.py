@@ -279,8 +279,8 @@ class SceneOptima(SceneAnalysis):
         Numerics:
             Closed form for a rigid device. Otherwise implicit derivatives of the active constraints, some ms per
             parameter, with a relative error of 1e-6; if a derivative is nearly 0, the absolute error is 1e-11 times
-            K_max over the parameter (1e-9 with a spring ten million times as stiff as the wall). For the dampings of
-            joints, numerical differences of K_max.
+            K_max divided by the parameter (1e-9 with a spring ten million times as stiff as the wall). Derivatives
+            with respect to joint dampings are numerical differences of K_max.
 
         Example:
             >>> import zwidth
@@ -412,7 +412,7 @@ class SceneOptima(SceneAnalysis):
 
         Numerics:
             Samples in the stable intervals of B, then golden-section search around the three lowest minima, because the
-            optimum is usually a kink at which poles meet. The spectral radius is accurate to about 1e-8 if two poles
+            optimum is usually a kink at which poles meet. The spectral radius is accurate to about 1e-7 if two poles
             meet. Run time 0.1 to 1 s.
 
         References:

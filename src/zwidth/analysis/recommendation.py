@@ -209,8 +209,8 @@ class Recommendation:
     def cascade_gains(self, units: PositionUnit | None = None, output_unit: float = 1.0) -> CascadeGains:
         """Return the gains of a position loop with an inner velocity loop, such as those of ODrive, for the wall.
 
-        The integrator gain is that of the scene. The wall is stable and satisfies the requirements with these gains:
-        the integrator of ``scene`` contains ``pos_gain`` = K/B of the recommended wall.
+        The gain of the integrator is that of the scene. The wall is stable and satisfies the requirements with these
+        gains, because the integrator of the field ``scene`` contains ``pos_gain`` = K/B of the recommended wall.
 
         Args:
             units: position unit of the gains: "turns", "degrees", "rad" or "m". Default: turns, or m for a linear
@@ -249,7 +249,7 @@ class Recommendation:
         return cast(PidGains, self._find_gains("pid", units, output_unit))
 
     def _find_gains(self, kind: ControllerKind, units: PositionUnit | None, output_unit: float) -> Any:
-        """Return the gains of the wall for a kind of controller; raise `InputError` if no wall is recommended."""
+        """Return the gains of a controller that renders the wall; raise `InputError` if no wall is recommended."""
         if self.status != Status.OK:
             raise InputError(f"gains: there is no wall: {self.reason}")
         scene = self.scene

@@ -1,11 +1,11 @@
-"""Stability of the virtual coupling to a tool that a physics engine integrates only every N periods.
+"""Stability of a virtual coupling to a tool that a physics engine integrates only every N periods.
 
-The loop is periodic with the period N T. Its poles are the eigenvalues of the monodromy matrix, which maps the state of
-the loop to the state N periods later (`zwidth.stability.linear.slow_tool`). alpha and beta are the normalized stiffness
-and damping of the coupling. The eigenvalues depend on alpha and beta in a nonlinear way, so the stable couplings are
-found by samples of the spectral radius and refinement of its crossings of 1: on geometric grids along a line of
-constant alpha or beta, and on a grid in the plane for the stiffest coupling. Methods that need the stability boundary
-as a curve, such as those for margins, islands and derivatives, raise `InputError`.
+The *coupling* between device and tool has the normalized stiffness alpha and damping beta. The loop is periodic with
+the period N T. Its poles are the eigenvalues of the *monodromy matrix*, which maps the state of the loop to the state N
+periods later (`zwidth.stability.linear.slow_tool`). The stable couplings are found from samples of the spectral radius:
+on geometric grids along a line of constant alpha or beta, and on a grid in the plane of both for the stiffest coupling.
+Crossings of 1 between samples are refined. Methods that need the stability boundary as a curve, such as those for
+margins, islands and derivatives, raise `InputError`.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from zwidth.stability.rigid.normalization import wall_status
 from zwidth.stability.rigid.verdict import StabilityMethod
 from zwidth.units.quantities import WALL_RANGE
 
-# Grids. The scale of alpha and beta is the stiffest wall of the device without a tool.
+# Grids of alpha and beta. Their *scales* are alpha and beta of the stiffest wall of the device without a tool.
 LOWEST, HIGHEST = 1e-7, 1e3  # ends of the range of alpha and beta, relative to their scales
-LIGHT_TOOL = 1e-4  # lower end of both ranges, relative to the coupling that a light tool allows by itself
+LIGHT_TOOL = 1e-4  # lower end of both ranges for a light tool of mass M, relative to M/(m N^2) (see `_grids`)
 PER_DECADE_ON_LINE = 24  # points per decade on a line of constant alpha or beta
-INSERTED = 12  # points inserted at an extremum of the spectral radius that may hide two crossings of 1
-INSERTIONS = 2  # number of insertions
-PER_DECADE = 8  # points per decade of the first grid in the plane
-FINE_DECADES, FINE_PER_DECADE = 2, 32  # range below the largest stable alpha that is sampled finely; its density
-POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # equally spaced beta on the fine grid, per N, and their range
-SUMMITS = 3  # highest local maxima of the fine grid that are refined
+INSERTED = 12  # points inserted at each extremum of the spectral radius that may hide two crossings of 1
+INSERTIONS = 2  # largest number of passes that insert such points
+PER_DECADE = 8  # points per decade of the first grid in the plane of alpha and beta
+FINE_DECADES, FINE_PER_DECADE = 2, 32  # decades below the largest stable alpha with a fine grid; points per decade
+POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # values of beta on the fine grid: number per N, and its limits
+SUMMITS = 3  # number of local maxima of the fine grid, the highest ones, that are refined
 
 # Refinement of a local maximum of alpha in a window of alpha and beta
 ROWS, COLUMNS = 12, 17  # points of alpha and of beta in the window
 FIRST_HEIGHT = 0.1  # height of the first window, relative to alpha
-SHRINK_HEIGHT, SHRINK_WIDTH = 1 / 3, 0.5  # ratio of the sizes of two successive windows
+SHRINK_HEIGHT, SHRINK_WIDTH = 1 / 3, 0.5  # factors by which height and width of the window shrink
 MAX_ZOOMS = 300  # largest number of windows
 CLOSE = 1e-13  # size of the last window, relative to alpha and beta
-SAME_MODULUS = 1e-6  # largest |log|z|| per N periods of poles on the unit circle at the stiffest coupling
+SAME_MODULUS = 1e-6  # poles z with |log|z|| below this (per N periods) count as poles on the unit circle
 
 
 class SlowToolLoop(LinearLoop):
@@ -59,16 +59,16 @@ class SlowToolLoop(LinearLoop):
 
     @cached_property
     def model(self) -> SlowToolModel:
-        """State-space model of the loop, from which the monodromy matrices of couplings follow."""
+        """State-space model of the loop, which yields the monodromy matrix of each coupling."""
         scene = self.scene
         return SlowToolModel.build(self.chain, scene.tool.compute_step(float(scene.mass), float(scene.timing.period)))
 
     @cached_property
     def roots(self) -> LoopRoots:
-        """Poles and zeros of the loop without a wall, which a periodic loop lacks: always raises `InputError`."""
+        """Poles and zeros of the loop without a wall; access raises `InputError`, because a periodic loop has none."""
         raise InputError(
-            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; with larger "
-            "values, only stability, spectral radius, poles, stable intervals and maximum stiffness are available"
+            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; for a slow "
+            "tool, choose K and B by the spectral radius and the stable intervals, which zwidth check prints"
         )
 
     @cached_property
@@ -76,7 +76,7 @@ class SlowToolLoop(LinearLoop):
         return len(self.model.drift)
 
     def _compute_logs(self, alpha: Array, beta: Array) -> Array:
-        """Return ``log|z|`` of the dominant pole per N periods; ``alpha`` and ``beta`` broadcast."""
+        """Return ``log|z|`` of the dominant pole z over N periods for couplings (alpha, beta), which are broadcast."""
         alpha, beta = np.broadcast_arrays(alpha, beta)
         return self.model.compute_multipliers(alpha.reshape(-1), beta.reshape(-1))[1].reshape(alpha.shape)
 
@@ -91,7 +91,7 @@ class SlowToolLoop(LinearLoop):
             raise InputError(f"method: got {method!r} with tool.every = {self.model.every}; use 'companion'")
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         logs = self._compute_logs(*nan_beyond(WALL_RANGE, alpha, beta))
-        # With K = 0 a free device and a tool drift apart: this pole is at exactly z = 1, so the coupling is decided.
+        # With alpha = 0, a pole may be at exactly z = 1 (device and tool drift apart); the coupling is then unstable.
         doubtful = (logs == 0) & (np.asarray(alpha) != 0)
         status = np.where((status == Status.OK) & doubtful, np.int32(Status.ON_BOUNDARY), status)
         status = np.where((status == Status.OK) & np.isnan(logs), np.int32(Status.NOT_CONVERGED), status)
@@ -128,11 +128,11 @@ class SlowToolLoop(LinearLoop):
 
     @cached_property
     def _grids(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Lower and upper end of the positive alpha, and of the positive beta, that searches sample."""
+        """Smallest and largest positive alpha, and smallest and largest positive beta, on the grids of searches."""
         wall = LinearLoop(self.scene.replace(tool=None)).stiffest(False)
         alpha = float(wall.alpha) if wall.status == Status.OK and wall.alpha > 0 else 1.0
         beta = max(alpha, float(wall.beta)) if np.isfinite(wall.beta) else alpha
-        # A tool of mass M between fixed walls, integrated with steps of N T, allows alpha up to 4 M/(m N^2).
+        # Start the grids far below 4 M/(m N^2), the largest stable alpha of a tool of mass M on a fixed device.
         light = LIGHT_TOOL / self.model.gain
         return (
             (min(LOWEST * alpha, light), HIGHEST * alpha),
@@ -156,7 +156,7 @@ class SlowToolLoop(LinearLoop):
         return np.reshape(np.array(intervals, float), (-1, 2))
 
     def least_stiffness(self, least: float) -> None:
-        """Return None, because the smallest stiffness of a device that is unstable without a wall is not computed."""
+        """Return None, because the smallest stable stiffness of a device that is unstable without a wall is unknown."""
 
     def islands(self, least: float) -> list[Island]:
         _ = self.roots
@@ -186,10 +186,10 @@ class SlowToolLoop(LinearLoop):
         return RidgePoint(np.float64(alpha), np.float64(beta), omega, np.int32(kind), np.int32(Status.OK))
 
     def _find_summits(self) -> list[tuple[float, float, float, float]] | None:
-        """Return the arguments of `_climb` for the highest local maxima of the largest stable alpha along beta.
+        """Return arguments of `_climb` for the highest local maxima of the largest stable alpha, a function of beta.
 
-        An alpha counts only if stable grid points connect it to the softest stable couplings. The list is empty if no
-        coupling is stable. The result is None if the stable couplings reach the largest alpha of the grid.
+        A stable alpha counts only if stable grid points connect it to the softest stable couplings. The list is empty
+        if no coupling is stable. The result is None if the stable couplings reach the largest alpha of the grid.
         """
         from scipy.ndimage import label
 
@@ -198,7 +198,7 @@ class SlowToolLoop(LinearLoop):
         stable = self._compute_logs(alpha[:, None], beta) < 0
         if not stable.any():
             return []
-        # Stiff couplings need a fine grid: between two steps of the tool, the device oscillates up to N/2 times.
+        # Use a fine grid for stiff couplings, because the device may oscillate N/2 times per step of the tool.
         top = np.flatnonzero(stable.any(1))[-1]
         if top == alpha.size - 1:
             return None
@@ -220,13 +220,15 @@ class SlowToolLoop(LinearLoop):
         ]
 
     def _refine_tops(self, alpha: Array, beta: Array, logs: Array, counted: Array) -> Array:
-        """Return for each beta the end above the largest alpha that counts of the stable alpha; 0 if none counts.
+        """Return, for each beta, the upper end of the stable interval that contains the largest counted alpha.
+
+        The result is 0 for a beta without a counted alpha.
 
         Args:
             alpha: rows of a grid.
             beta: columns of the grid.
             logs: ``log|z|`` of the dominant pole on the grid.
-            counted: True for the stable points of the grid that count.
+            counted: True for the stable grid points that count (see `_find_summits`).
         """
         last = alpha.size - 1 - np.argmax(counted[::-1], 0)
         tops = np.where(counted.any(0), alpha[last], 0.0)
@@ -237,23 +239,26 @@ class SlowToolLoop(LinearLoop):
         return tops
 
     def _climb(self, alpha: float, beta: float, height: float, width: float) -> tuple[float, float, bool]:
-        """Return alpha and beta of a local maximum of alpha of the stable couplings, and whether the search converged.
+        """Climb from a stable coupling to a local maximum of alpha among the stable couplings.
 
         Args:
-            alpha: alpha of a stable coupling.
-            beta: beta of this coupling.
-            height: height of the window above ``alpha`` in which the maximum is sought first.
-            width: half the width of this window around ``beta``.
+            alpha: alpha of the first coupling.
+            beta: beta of the first coupling.
+            height: height of the first search window, above ``alpha``.
+            width: half the width of the first search window, around ``beta``.
+
+        Returns:
+            alpha and beta at the maximum, and True if the search converged.
         """
         highest, widest = height, width
         for _ in range(MAX_ZOOMS):
             rows, columns = np.linspace(alpha, alpha + height, ROWS), beta + width * np.linspace(-1.0, 1.0, COLUMNS)
             logs = self._compute_logs(rows[:, None], np.maximum(columns, 0.0))
-            # Stop below the first row without a stable coupling, because the window must not move to another region.
+            # Stay below the first row without stable couplings, because rows above it may belong to another region.
             row = max(int(np.argmin(np.append((logs < 0).any(1)[1:], False))), 0)
             column = int(np.argmin(logs[row]))
             alpha, beta = float(rows[row]), max(float(columns[column]), 0.0)
-            # Enlarge the window if the best coupling is at its end, so that the window moves; otherwise shrink it.
+            # Enlarge the window if the best coupling is at its edge, because the maximum may be outside. Else shrink.
             at_side = column in (0, COLUMNS - 1) and columns[column] > 0
             if row == ROWS - 1:
                 height = min(height / SHRINK_HEIGHT, highest)
@@ -269,19 +274,20 @@ class SlowToolLoop(LinearLoop):
 
 
 def space(low: float, high: float, per_decade: int) -> Array:
-    """Return a geometric grid with at least this number of points per decade."""
+    """Return a geometric grid from ``low`` to ``high`` with at least ``per_decade`` points per decade."""
     return np.geomspace(low, high, int(np.ceil(np.log10(high / low) * per_decade)) + 1)
 
 
 def find_intervals(evaluate: Callable[[Array], Array], ends: tuple[float, float]) -> list[tuple[float, float]]:
-    """Return the intervals of a variable in which a function is negative, ascending.
+    """Return the intervals in which a function of one variable is negative, in ascending order.
 
     The function is sampled at 0 and on geometric grids of positive and of negative values. Points are inserted at local
     extrema that may hide two crossings of zero.
 
     Args:
         evaluate: the function.
-        ends: smallest and largest magnitude of the samples. An interval that contains the largest one is unbounded.
+        ends: smallest and largest magnitude of the samples. An interval is unbounded if it contains the sample of the
+            largest magnitude.
     """
     sides = [_find_on_side(partial(_mirror, evaluate, sign), ends) for sign in (-1.0, 1.0)]
     negative, positive = [(-high, -low) for low, high in reversed(sides[0])], sides[1]
@@ -291,12 +297,12 @@ def find_intervals(evaluate: Callable[[Array], Array], ends: tuple[float, float]
 
 
 def _mirror(evaluate: Callable[[Array], Array], sign: float, x: Array) -> Array:
-    """Return the function at sign x."""
+    """Return the value of a function at ``sign * x``."""
     return evaluate(sign * x)
 
 
 def _find_on_side(evaluate: Callable[[Array], Array], ends: tuple[float, float]) -> list[tuple[float, float]]:
-    """Return the intervals of positive x in which a function is negative; the first may begin at 0."""
+    """Return the intervals of x > 0 in which a function is negative; the first interval may begin at 0."""
     x = space(*ends, PER_DECADE_ON_LINE)
     values = evaluate(x)
     for _ in range(INSERTIONS):

@@ -34,7 +34,7 @@ class Tolerance(NamedTuple):
     distribution has a standard deviation of ``share`` times the nominal value.
     """
 
-    share: float | str  # a number, or a text such as "5%"
+    share: float | str  # relative tolerance, a number or a text such as "5%"
     distribution: Literal["uniform", "normal"] = "uniform"
 
 
@@ -67,7 +67,7 @@ def simulate_tolerances(
 
     Args:
         scene: nominal device, timing, other parts, and the wall.
-        tolerances: a `Tolerance` or its share by dotted path, as in ``scene.parameters()``; e.g. ``{"mass": 0.1}`` or
+        tolerances: a `Tolerance`, or its share, per dotted path of ``scene.parameters()``; e.g. ``{"mass": 0.1}`` or
             ``{"mass": "10%"}``.
         samples: number of drawn devices, up to 1,000,000. A rigid scene takes some microseconds per device, any other
             scene about a millisecond.

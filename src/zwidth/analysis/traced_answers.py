@@ -46,7 +46,7 @@ def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float =
 
 
 def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], unknowns: Sequence[Taylor]) -> None:
-    """Store the derivatives of unknowns in the given rows of the results for one point."""
+    """Store the derivatives of each unknown in its row, from ``rows``, of the results for one point."""
     for row, unknown in zip(rows, unknowns, strict=False):
         for result, part in zip(results[1:], (unknown.first, unknown.second), strict=False):
             result[point, row] = part
@@ -124,7 +124,7 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
         ) -> None:
             margin, *angle = differentiate(scene, order, wall, unknowns, equations, added)
             for result in results[1:]:
-                result[k, rows] = 0.0  # for the angle, unless it is one of the unknowns
+                result[k, rows] = 0.0  # for a constant angle; overwritten below if the angle is an unknown
             fill_rows(results, k, rows, [margin * factor, *angle])
 
         if np.isfinite(w_gain):
@@ -304,7 +304,7 @@ def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *o
 def _differentiate_required(
     scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
 ) -> Taylor:
-    """Return a required parameter value, with derivatives in the numbers of the scene and the required stiffness."""
+    """Return the parameter value for a required stiffness, with derivatives in the scene and in this stiffness."""
     path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
     changed = scene.replace(**{path: x})
     count, index = len(list_leaves(scene)), index_parameters(changed)[path]
@@ -340,9 +340,9 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
     "required": (find_required, 5),
     "environment_limit": (find_environment_limits, 3),
 }
-"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`.
+"""For each method of a loop (`zwidth.analysis.loop`): function that computes its results, and their number.
 
-The method "environment_limit" belongs to `zwidth.AdmittanceDisplay`, which takes the place of the scene.
+The method "environment_limit" belongs to `zwidth.AdmittanceDisplay`; its function has a display in place of the scene.
 """
 
 # Values for scenes with a parameter out of range, for methods whose values are then not all NaN; the label 0 means

@@ -123,9 +123,10 @@ class TracedLoop(LinearLoop):
         )
 
     def _forbid_derivatives(self, value: Array) -> Array:
-        """Return the value; differentiation by JAX raises `InputError` if the tool makes one step per several periods.
+        """Return the value unchanged; its derivatives by JAX raise `InputError` if the tool has ``every`` > 1.
 
-        The derivatives of other loops follow from their stability boundary, which this loop lacks.
+        Derivatives are computed from the stability boundary, which is not available if the tool makes one step per
+        several periods.
         """
         tool = self.scene.tool
         if tool is None or tool.every == 1:

@@ -1,17 +1,17 @@
-"""Find a passive virtual world and a hand with which a virtual coupling is unstable.
+"""Find a passive virtual world and a passive hand with which a virtual coupling is unstable.
 
-A coupling, a spring K and a damper B, that violates the condition of `is_safe_for_every_world` is unstable with some
-passive world and some passive operator. The search constructs both from the frequencies w (rad per period) that violate
-the condition (docs/theory/passivity.md, U8). With the impedance C of the coupling, g = Re(1/C) and a delay of n
-periods, the world that extracts most energy at w is lossless, and the coupling and the world together have the
-admittance
+The *coupling* is a spring K and a damper B between the device and the *world*, a tool with a mass and, in some cases, a
+spring to ground. A coupling that violates the condition of `is_safe_for_every_world` is unstable with some world and
+some hand. The search constructs both from the frequencies w (rad per period) that violate the condition
+(docs/theory/passivity.md, U8). With the impedance C of the coupling, g = Re(1/C) and a delay of n periods, the world
+that extracts the most energy at w is lossless. Its impedance Z_w follows from the impedance Z of coupling and world
+together,
 
     1/Z = g (1 + j cot((n + 1) w/2)),     1/Z_w = 1/Z - 1/C
 
-Z_w is the impedance of the world at w: that of a mass if its imaginary part X is positive, otherwise that of a mass
-with a spring to ground. The hand is a mass, with a spring to ground so stiff that device and hand oscillate at w. In
-this module the sampling period and the mass of the device are the units of time and mass: ``alpha = K T^2/m``, ``beta =
-B T/m``, ``delta = b T/m``.
+If the imaginary part X of Z_w is positive, the world is a mass, otherwise a mass with a spring to ground. The hand is a
+mass, with a spring to ground so stiff that device and hand oscillate at w. In this module the sampling period and the
+mass of the device are the units of time and mass: ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
     from zwidth.analysis.walls import Wall
 
-NODES = 800  # frequencies at which the condition is evaluated
-LOWEST = 1e-4  # lowest of these frequencies, in rad per period
-MAX_FREQUENCIES = 24  # largest number of violating frequencies for which worlds are constructed
-MAX_MASSES = 6  # masses of the hand per frequency
-HEAVIEST = 1e4  # ratio of the heaviest to the lightest mass of the hand
-LEAST_GROWTH = 1e-13  # smallest log radius of a world that counts as unstable, above the rounding error of poles
-TOOL_MASSES = 1e-6, 1e9  # masses of the tool, in masses of the device; the heaviest one stands for a fixed tool
+NODES = 800  # number of frequencies at which the condition of `is_safe_for_every_world` is evaluated
+LOWEST = 1e-4  # lowest tested frequency, in rad per period
+MAX_FREQUENCIES = 24  # largest number of frequencies, at which the condition is violated, with tested worlds
+MAX_MASSES = 6  # number of masses of the hand that are tested per frequency
+HEAVIEST = 1e4  # ratio of the largest to the smallest tested mass of the hand
+LEAST_GROWTH = 1e-13  # smallest logarithm of the spectral radius that counts as unstable, above rounding errors
+TOOL_MASSES = 1e-6, 1e9  # smallest and largest mass of the tool, relative to the mass of the device
 
 
 @compact_repr(
@@ -58,12 +58,12 @@ class UnsafeWorld(NamedTuple):
     hand_mass: float  # mass in kg that the hand adds to the device
     hand_stiffness: float  # stiffness of the hand to ground in N/m
     frequency: float  # frequency of the growing oscillation in Hz
-    spectral_radius: float  # > 1
+    spectral_radius: float  # spectral radius of the loop, > 1
     status: Status  # OK; UNREACHABLE if the coupling is safe; NOT_CONVERGED if no world was found
 
 
 class _World(NamedTuple):
-    """Masses and stiffnesses of an `UnsafeWorld`, for T = 1 and m = 1."""
+    """Masses and stiffnesses of an `UnsafeWorld` in units in which sampling period and mass of the device are 1."""
 
     tool_mass: float
     tool_stiffness: float
@@ -72,10 +72,11 @@ class _World(NamedTuple):
 
 
 def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = None) -> UnsafeWorld:
-    """Return a passive tool and hand with which a virtual coupling beyond `is_safe_for_every_world` is unstable.
+    """Return a passive tool and a passive hand with which a virtual coupling is unstable.
 
-    The tool is a mass M with a spring k to ground. Its program integrates by the trapezoidal rule, so the tool is
-    lossless: with the force f of the coupling, the velocity v and the force s of the spring, it computes
+    They exist if the coupling violates the condition of `is_safe_for_every_world`. The tool is a mass M with a spring k
+    to ground. Its program integrates by the trapezoidal rule, so the tool is lossless: from the force f of the
+    coupling, the velocity v, the force s of the spring and the position y, it computes the new values
     ``v' = v + T/(2M) (f' - s' + f - s)``, ``s' = s + k T/2 (v' + v)`` and ``y' = y + T v'``. The hand is a mass and a
     spring to ground, rigidly connected to the device. The tool and the operator of the scene have no effect.
 
@@ -92,9 +93,10 @@ def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = N
         InputError: as `is_safe_for_every_world`; or the coupling is not one pair of finite numbers.
 
     Numerics:
-        With B = 0, the search finds a world from about 1.00001 times the safe stiffness on. With the B of the stiffest
-        safe coupling, it finds one from 1.07 (one period of delay) or 1.04 (two periods) times the safe stiffness on,
-        because a hand with a single resonance is not the worst operator at high frequencies. Takes about 1 s.
+        With B = 0, the search finds a world if K exceeds about 1.00001 times the safe stiffness. With the B of the
+        stiffest safe coupling, K must exceed 1.07 times (one period of delay) or 1.04 times (two periods) the safe
+        stiffness, because a hand with a single resonance is not the worst operator at high frequencies. The search
+        takes about 1 s.
 
     References:
         Colgate, Schenkel 1994 (the operator that destabilizes a wall that is not passive).
@@ -130,15 +132,15 @@ def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = N
 
 
 def _report_none(status: Status) -> UnsafeWorld:
-    """Return the result without a world."""
+    """Return an `UnsafeWorld` with the given status whose other fields are NaN."""
     nan = math.nan
     return UnsafeWorld(nan, nan, nan, nan, nan, nan, status)
 
 
 def _search(alpha: float, beta: float, delta: float, n_delay: int) -> tuple[_World, float, float] | None:
-    """Return the world with the largest spectral radius, the logarithm of this radius and the angle of the pole.
+    """Return the world with the largest spectral radius, the logarithm of this radius, and the angle of its pole.
 
-    The result is None if the search finds no world with a confirmed radius above 1.
+    The result is None if no world has a radius above 1 that a pole count confirms.
     """
     results = []
     for world in _list_worlds(alpha, beta, delta, n_delay):
@@ -154,7 +156,7 @@ def _search(alpha: float, beta: float, delta: float, n_delay: int) -> tuple[_Wor
 
 
 def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[_World]:
-    """Return candidates: for each frequency that violates the condition, one tool and hands of several masses."""
+    """Return candidate worlds: per frequency that violates the condition, one tool with hands of several masses."""
     w = np.union1d(np.geomspace(LOWEST, np.pi, NODES // 2), np.linspace(LOWEST, np.pi, NODES // 2))[:-1]
     one_minus_inverse = 1.0 - np.exp(-1j * w)
     coupling = beta + alpha / one_minus_inverse
@@ -168,11 +170,11 @@ def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[
         susceptance = g / np.tan(phase) - (1.0 / coupling).imag
         X = -1.0 / susceptance
         stiffness = one_minus_inverse * np.exp(-1j * n_delay * w) / (1.0 / coupling + 1j * susceptance)
-    # Real part of the force per position that the zero-order hold applies to the device.
+    # Stiffness of coupling and world at w: the real part of the ratio of the held force to the position of the device
     spring = (stiffness * one_minus_inverse / (1j * w)).real
     worlds = []
     for k in chosen.tolist():
-        # A mass M has the reactance 2 M tan(w/2). If X is negative, add a spring with the reactance 2 X.
+        # A mass M has the reactance 2 M tan(w/2). If X < 0, take the mass with the reactance -X, and a spring with 2 X.
         half = math.tan(0.5 * w[k])
         tool = float(np.clip(np.nan_to_num(abs(X[k]) / (2.0 * half), nan=np.inf), *TOOL_MASSES))
         spring_to_ground = -4.0 * X[k] * half if X[k] < 0 and tool < TOOL_MASSES[1] else 0.0
@@ -184,12 +186,12 @@ def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[
 
 
 def _build_loop(world: _World, delta: float, n_delay: int) -> tuple[LoopRoots, float]:
-    """Return the loop of the coupling with a world, whose unit of mass is device plus hand, and this mass."""
+    """Return the loop of the coupling and a world, and the sum of the masses of device and hand, its unit of mass."""
     M, k, hand_mass, hand_stiffness = world
     total = 1.0 + hand_mass
     body = Body(1.0, delta / total, hand_stiffness / total)
     device = factor_chain(Chain((body,), (), (), None, 0, float(n_delay), n_delay, Estimate()))
-    # With zeta = z - 1, the tool has the response z (z + 1)/(2 M zeta^2 + (k/2) (z + 1)^2).
+    # The tool has the response z (z + 1)/(2 M zeta^2 + (k/2) (z + 1)^2) from force to position, with zeta = z - 1.
     inertia, spring = 2.0 * M / total, 0.5 * k / total
     poles = -np.roots([inertia + spring, 4.0 * spring, 4.0 * spring]) if spring else np.zeros(2)
     tool = FactoredPlant(1.0 / (inertia + spring), 0, np.array([1.0, 2.0], complex), poles.astype(complex))

@@ -35,7 +35,7 @@ from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
-LOCALS = (*"uvwefyr", "v_free", "y_tool", "v_tool", "v_rest")  # local variables of programs, which C programs declare
+LOCALS = (*"uvwefyr", "v_free", "y_tool", "v_tool", "v_rest")  # names of local variables, which C programs declare
 # Largest ratio of imaginary part to modulus at which a root is treated as real, because rounding errors cause a small
 # imaginary part.
 REAL_TOLERANCE = 1e-13
@@ -141,14 +141,14 @@ def write_wall(
 
 
 class FilterCode(NamedTuple):
-    """Statements of a filter. The variable u is the input before the statements and the output after them.
+    """Statements of a filter, which replace its input in the variable u by its output.
 
-    The output must be multiplied by the factor ``gain``.
+    The caller must multiply this output by the factor ``gain``.
     """
 
     states: list[str]  # names of the states
     start: list[str]  # statements that set the states to their steady state for a constant u, and u to the output
-    update: list[str]  # statements that compute the output from the input, and the states of the next sample
+    update: list[str]  # statements that compute the output, and the states for the next sample
     output: list[str]  # statements that compute only the output, and leave the states unchanged
     gain: float  # factor by which u is to be multiplied after the statements
 
@@ -245,13 +245,13 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
 
 
 def write_memory(language: str, count: int, name: str, value: str, prefix: str = "") -> tuple[list[str], list[str]]:
-    """Return the declarations in C, and the statements that set the memory of a difference to a value.
+    """Return declarations (C) and initial statements for the past samples that a difference needs.
 
     Args:
         language: "c" or "python".
-        count: length of the difference in periods; 0 for none. For more than 1, the memory is an array.
-        name: name of the state if it is no array.
-        value: expression of the value.
+        count: length of the difference in periods; 0 without a difference. More than one past sample need an array.
+        name: name of the state if a single past sample suffices.
+        value: initial value of all past samples, as an expression in the language.
         prefix: beginning of the names of the array and of its index.
     """
     if count <= 1:
@@ -284,12 +284,12 @@ def format_c(name: str, comment: Sequence[str], members: Sequence[str], start: l
     """Return the source code of a C program with a struct for its states and two functions.
 
     Args:
-        name: name of the pointer to the struct, and beginning of the names of the functions, as "wall".
+        name: name of the pointer to the struct, and beginning of the names of the functions, such as "wall".
         comment: lines of the comment at the head.
         members: declarations of the states.
         start: statements of the function that initializes the states; a comment starts with "# ".
-        force: statements of the function that is called once per period. Those with an indentation follow a condition
-            in the syntax of Python, as "if @k == 0:".
+        force: statements of the function that is called once per period. A condition has the Python syntax, such as
+            "if @k == 0:", and is followed by indented statements.
     """
     blocks = []
     for block in (start, force):

@@ -47,10 +47,11 @@ GRASP_GUESS = 0.95  # factor on K for the initial guess if a grasp destabilizes 
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
-MATCHED = 1e-5  # relative change of K/B at which the search for a wall that matches the integrator of a cascade ends
-RESTARTS = (0.5, 0.1, 0.02)  # pos_gain of further searches, relative to that of the wall without integrator
-MAX_MATCHES = 8  # walls that this search chooses; 3 usually suffice
-# Factors on K and B, tried in this order, until a wall satisfies the requirements with the integrator that matches it.
+# Search for the wall of a cascade, whose integrator contains pos_gain = K/B and therefore depends on the wall
+MATCHED = 1e-5  # relative change of K/B below which the search has converged
+RESTARTS = (0.5, 0.1, 0.02)  # pos_gain at the start of further searches, relative to K/B without the integrator
+MAX_MATCHES = 8  # largest number of walls chosen per search; 3 usually suffice
+# Factors on K and B, tried in this order, until the wall with its integrator satisfies the requirements
 REDUCTIONS = (1.0, 1.0 - 1e-5, 1.0 - 1e-4, 0.999, 0.99, 0.97, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
 MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually suffice
 
@@ -334,7 +335,7 @@ def _choose_free(
         usual = min(max(usual, low), high)
     spare = slack(most, usual)
     if spare and not (requirements.stiffness_fraction and min(spare.values()) >= 0):
-        # Return before the search, which may take half a minute, if the damping excludes every passive wall.
+        # Do not start the search, which may take half a minute, if the damping excludes every passive wall.
         reason, reserve = "", 0.0 if safe is None else safe.damping_reserve
         if requirements.passive and scene.device.damping == 0:
             reason = "no passive wall exists, because the device has no physical damping"
@@ -356,9 +357,9 @@ def _choose_free(
 
 
 class ControllerChoice(NamedTuple):
-    """A chosen wall, and the scene and the stiffest wall for which it is chosen."""
+    """The chosen wall of a scene, this scene, and its stiffest stable wall."""
 
-    scene: SceneOptima  # the given scene; if it is that of a cascade, with the integrator that matches the wall
+    scene: SceneOptima  # the given scene; for a cascade, a copy whose integrator contains pos_gain = K/B
     top: StiffestWall  # the stiffest stable wall of this scene
     wall: WallChoice
 
@@ -366,10 +367,10 @@ class ControllerChoice(NamedTuple):
 def choose_controller(
     scene: SceneOptima, requirements: Requirements, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> ControllerChoice:
-    """Choose the stiffest wall of a scene by `choose_wall`; for a cascade, with the integrator that matches the wall.
+    """Choose the stiffest wall of a scene by `choose_wall`; for a cascade, with its integrator.
 
-    The integrator of a cascade integrates the velocity plus ``pos_gain`` times the position, and ``pos_gain`` is K/B.
-    Each new wall therefore changes the integrator. The search chooses a wall, matches the integrator to this wall and
+    The integrator of a cascade integrates the velocity plus ``pos_gain`` times the position. Because ``pos_gain`` is
+    K/B, each new wall changes the integrator. The search chooses a wall, matches the integrator to this wall and
     chooses again until K/B converges. Then K and B are reduced together, which does not change the integrator, until
     the loop with the matching integrator satisfies the requirements.
 
@@ -381,7 +382,7 @@ def choose_controller(
         return ControllerChoice(scene, top, choice)
     first = result = _match_integrator(scene, feedback, requirements, top, choice, width)
     if result.wall.status != Status.OK:
-        # Start again from smaller values of pos_gain, because the given one may be too large for every wall.
+        # Search again from smaller values of pos_gain, because no wall may be stable with the given value.
         free = scene.replace(feedback=None)
         start = choose_wall(free, requirements, free.max_stiffness(), None, COARSE)
         for factor in RESTARTS if start.status == Status.OK and start.damping > 0 else ():
@@ -403,7 +404,7 @@ def _match_integrator(
     choice: WallChoice,
     width: float,
 ) -> ControllerChoice:
-    """Choose walls until the integrator of a cascade matches the wall; ``choice`` is the first wall of ``scene``."""
+    """Choose walls until pos_gain in the integrator of a cascade equals K/B; ``choice`` is the first wall."""
     for _ in range(MAX_MATCHES):
         if choice.status != Status.OK:
             return ControllerChoice(scene, top, choice)
@@ -423,7 +424,7 @@ def _match_integrator(
 def _confirm_cascade(
     scene: SceneOptima, feedback: IntegralFeedback, requirements: Requirements, choice: WallChoice
 ) -> ControllerChoice:
-    """Reduce K and B together until the loop with the matching integrator satisfies the requirements."""
+    """Reduce K and B together until the loop with pos_gain = K/B in its integrator satisfies the requirements."""
     safe = None if requirements.beyond_safe else scene.safe_limit
     for factor in REDUCTIONS if choice.status == Status.OK else ():
         wall = float(f"{factor * choice.stiffness:.6g}"), float(f"{factor * choice.damping:.6g}")

@@ -362,7 +362,7 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
 
 
 def refuse_slow_tool(scene: SceneParts, result: str) -> None:
-    """Raise `InputError` if the tool of a scene makes one step per several periods; ``result`` names what needs one."""
+    """Raise `InputError` if the tool has ``every`` > 1; ``result`` is the name of the unavailable result."""
     if scene.tool is not None and scene.tool.every != 1:
         raise InputError(f"tool.every: got {scene.tool.every}, but {result} needs one step per period; set every=1")
 

@@ -1,4 +1,9 @@
-"""Printed gains of PID and cascade controllers, in the units of the controller (`model.controller_gains`)."""
+"""Write the gains of motor controllers as text, with the units of the controller.
+
+A controller is of the kind "pid" (gains kp, ki, kd) or "cascade" (pos_gain, vel_gain, vel_integrator_gain), which is a
+position loop with an inner velocity loop (`zwidth.model.controller_gains`). The unit of a gain consists of the unit of
+the output, such as N m, and of the position unit, such as turns.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,7 @@ _SINGULAR = {"turns": "turn", "degrees": "deg", "rad": "rad", "m": "m"}
 
 
 def list_units(kind: ControllerKind, units: PositionUnit, output: str) -> dict[str, str]:
-    """Return the unit of each gain of a controller by name.
+    """Return a dict with the unit of each gain of a controller, such as ``{"pos_gain": "1/s"}``.
 
     Args:
         kind: "pid" or "cascade".
@@ -33,18 +38,18 @@ def list_units(kind: ControllerKind, units: PositionUnit, output: str) -> dict[s
 
 
 def spell_gains(kind: ControllerKind, gains: Mapping[str, float], units: PositionUnit, output: str) -> str:
-    """Return a phrase with the gains of a controller that are not 0, and their units; see `list_units`."""
+    """Return a phrase with the nonzero gains of a controller and their units; other arguments as in `list_units`."""
     named = list_units(kind, units, output)
     return ", ".join(f"{name} {plain(gain)} {named[name]}" for name, gain in gains.items() if gain)
 
 
 def spell_output(rotary: bool, output_unit: float) -> str:
-    """Return the unit of the output of a controller: N or N m, or "output" if its unit is another one."""
+    """Return the unit of the output: N m (rotary) or N (linear) if ``output_unit`` is 1, otherwise "output"."""
     return "output" if output_unit != 1.0 else "N m" if rotary else "N"
 
 
 def list_cascade(recommendation: Recommendation) -> dict[str, Any]:
-    """Return the gains of a recommended cascade with their position unit; empty if the scene is not a cascade's."""
+    """Return the gains of a recommended cascade and their position unit; an empty dict without a cascade or a wall."""
     scene = recommendation.scene
     integrator = isinstance(scene.feedback, IntegralFeedback) and scene.feedback.is_cascade
     if not integrator or recommendation.status != Status.OK:
@@ -54,7 +59,7 @@ def list_cascade(recommendation: Recommendation) -> dict[str, Any]:
 
 
 def format_cascade(recommendation: Recommendation) -> list[str]:
-    """Return a list with the printed line of the gains of a recommended cascade; empty without these gains."""
+    """Return a list with the printed line of the gains of a recommended cascade; an empty list without these gains."""
     named = list_cascade(recommendation)
     if not named:
         return []

@@ -1,7 +1,8 @@
 """Command `zwidth admittance`: the environments in which an admittance display is stable.
 
-An admittance display is a robot that measures the contact force and moves like a virtual mass M with a virtual damping
-D. The environment, or the hand of a user, is a spring K and a damper B between the robot and ground.
+The display is a robot that moves like a virtual mass M with damping D. The environment is a spring K and a damper B
+between the robot and ground, e.g. the hand of a user. The robot measures the contact force and follows the motion of
+the virtual mass with a lag and a delay.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from zwidth.model.timing import Timing
 from zwidth.units.formatting import format_interval, format_stiffness, plain, round_conservatively, with_unit
 from zwidth.units.quantities import FIELDS, NOT_NEGATIVE, POSITIVE
 
-# Parameters of a robot that follows its command with a lag: fields of `Actuator`, with the help of their options.
+# Help texts of the options --robot-... of a robot that follows its command with a lag, by field of `Actuator`.
 _LAG = {
     "cutoff": "Bandwidth of the robot, the corner frequency of its lag, in Hz.",
     "time_constant": "Time constant of the robot's lag, in s; instead of the bandwidth.",
@@ -34,7 +35,7 @@ _LAG = {
 
 
 def _add_lag(command: Any) -> Any:
-    """Return a command with one option for each parameter of the robot's lag."""
+    """Add one option for each parameter of the robot's lag to a command, and return the command."""
     for name, text in reversed(_LAG.items()):
         kind = click.INT if name == "order" else quantity_type(FIELDS[f"actuator.{name}"].unit, POSITIVE)
         command = click.option(f"--robot-{name.replace('_', '-')}", f"robot_{name}", type=kind, help=text)(command)
@@ -91,13 +92,13 @@ def admittance(
     """Compute the environments in which an admittance display is stable.
 
     An admittance display is a robot that measures the contact force and moves like a virtual mass with a virtual
-    damping. The command prints the largest stiffness of the environment such that the display is stable from 0 to this
-    stiffness. With --environment, it also assesses the contact with this environment, and prints the virtual masses and
-    the virtual dampings with which the contact is stable, if only one of them is changed.
+    damping. The command prints a stiffness K_max: the display is stable in all environments from K = 0 to K_max. With
+    --environment, the command also assesses the contact with this environment. It then prints the virtual masses, and
+    the virtual dampings, with which the contact is stable if only that parameter is changed.
 
     The options --virtual-mass, --virtual-damping, --rate (or --period) and a model of the robot are required. The model
-    is --robot-time-constant, --robot-cutoff or --robot. The hand of a user is an environment, too. The exit code is 0
-    for stable and for unstable contacts, and 1 if no environment is stable.
+    is --robot-time-constant, --robot-cutoff or --robot. The hand of a user is an environment, too. The exit code is 1
+    if no environment is stable and --environment is not given, otherwise 0.
     """
     display = _make_display(**given)
     if code is not None:
@@ -136,7 +137,7 @@ def _make_display(
     integrator: Any,
     **lag: Any,
 ) -> Any:
-    """Return the display with the given options; raise `click.UsageError` if an option is missing."""
+    """Return the display that the options describe; raise `click.UsageError` if a required option is missing."""
     from zwidth.analysis.admittance import AdmittanceDisplay
 
     if len({"period", "rate"} & timing.keys()) != 1:
@@ -150,12 +151,12 @@ def _make_display(
     try:
         model = LinearDevice(robot, loop_timing.period if robot_sampled else None) if robot else Actuator(**parameters)
     except InputError as error:
-        # Name the option of the parameter; the messages of a lag have the owner "actuator".
+        # Name the option, such as --robot-cutoff, in place of the field "actuator.cutoff" of the message.
         field, _, text = str(error).partition(": ")
         name = field.partition(".")[2]
         raise InputError(f"robot{f'_{name}' if name else ''}: {text}") from None
     rotary = bool(find_kind(get_options_with_kind()))
-    # Pass the numbers with their units, because the units determine the kind of the display, linear or rotary.
+    # Pass texts with units, because the display derives its kind, linear or rotary, from them.
     mass, damping = (
         f"{virtual_mass!r} {'kg m^2' if rotary else 'kg'}",
         f"{virtual_damping!r} {'N m s/rad' if rotary else 'N s/m'}",
@@ -164,7 +165,7 @@ def _make_display(
 
 
 def _describe(display: Any) -> list[str]:
-    """Return printed lines with the parameters of the display and of its robot."""
+    """Return the printed lines with the parameters of the display and of its robot, and with a caution."""
     units, timing = display.unit_system, display.timing
     mass, damping = (
         with_unit(value, units[unit])
@@ -190,7 +191,7 @@ def _describe(display: Any) -> list[str]:
 
 
 def _spell_limit(display: Any, limit: Any, damping: float) -> str:
-    """Return a printed line with the largest stiffness of the environment."""
+    """Return the printed line with K_max, the largest stable stiffness of environments with the given damping B."""
     units = display.unit_system
     with_damper = f" with B = {with_unit(damping, units['N s/m'])}" if damping else ""
     if limit.status != Status.OK:
@@ -200,7 +201,7 @@ def _spell_limit(display: Any, limit: Any, damping: float) -> str:
 
 
 def _assess(display: Any, stiffness: float, damping: float, limit: Any) -> tuple[dict[str, Any], list[str]]:
-    """Return the assessment of the contact with an environment, as a dict and as printed lines, the verdict first."""
+    """Assess the contact with an environment; return results as a dict and printed lines, the verdict first."""
     units, scene = display.unit_system, display.scene(stiffness, damping)
     is_stable, radius = bool(display.is_stable(stiffness, damping)), float(scene.spectral_radius())
     pole, margins = scene.dominant_pole(), scene.margins()
@@ -231,12 +232,14 @@ def _assess(display: Any, stiffness: float, damping: float, limit: Any) -> tuple
         lines[-1] += f"; this environment has {plain(used, 3)} % of K_max"
     ranges = (("M", mass.virtual_mass, mass.largest, "kg"), ("D", least.virtual_damping, least.largest, "N s/m"))
     spelled = [_spell_range(name, low, high, units[unit]) for name, low, high, unit in ranges]
-    lines.append(format_line("room" if is_stable else "remedy", f"{'; '.join(spelled)}, each alone"))
+    lines.append(
+        format_line("room" if is_stable else "remedy", f"{'; '.join(spelled)}, each alone; no margins at the ends")
+    )
     return result, lines
 
 
 def _spell_range(name: str, low: float, high: float, unit: str) -> str:
-    """Return a phrase with the stable range of a parameter, rounded inward."""
+    """Return a phrase with the stable interval of a parameter; rounding never extends the interval."""
     if math.isnan(low):
         return f"no {name} is stable"
     if math.isinf(high):

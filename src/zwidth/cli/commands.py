@@ -25,6 +25,7 @@ from zwidth.cli.options import (
     SHARE,
     Parsed,
     beyond_safe_option,
+    code_option,
     figure_option,
     find_omitted,
     folder_argument,
@@ -47,8 +48,8 @@ from zwidth.units.quantities import SIZES, Range
 
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
-# Delay in periods from which `recommend` announces a long search. Every wall of the search needs the poles of the loop,
-# whose number grows with the delay, and the time for all poles grows with the cube of their number.
+# Delay in periods from which `recommend` announces a long search. For each wall, the search computes all poles of the
+# loop. Their number grows with the delay, and the time to compute them grows with the cube of their number.
 LONG_SEARCH = 300.0
 _PACKAGE = Path(__file__).resolve().parents[1]
 # Pattern of an entry of a configuration that refers to a CSV table in the same folder.
@@ -74,16 +75,21 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @hardware_options
+@code_option
 @verbose_option
 @json_option
-def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
+def check(scene: Any, hardware: dict[str, Any], code: Any, verbose: bool, as_json: bool) -> None:
     """Assess one wall: stability, margins and passivity; for an unstable wall, the changes that stabilize it.
 
     The options --stiffness, --mass (or --device) and --rate (or --period) are required; the defaults of damping and
     delay are 0. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). With
     --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and saturation.
-    The exit code is 0 for stable and for unstable walls.
+    With --code, it prints only a program for the control loop, if the wall is stable. The exit code is 0 for stable and
+    for unstable walls.
     """
+    if code:
+        click.echo(scene.code(language=code, max_force=hardware.get("max_force", math.inf)), nl=False)
+        return
     from zwidth.analysis.assessment import assess, limits_of
     from zwidth.analysis.stabilization import stabilize
     from zwidth.app.verdict import format_check
@@ -188,7 +194,11 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the islands of a scene for a record; None if they are not available, with some tools."""
+    """Return the separate stable regions as dicts.
+
+    The result is None for a tool that is integrated only every N > 1 periods, and for a tool with which couplings of
+    arbitrarily large K are stable.
+    """
     return [island._asdict() for island in scene.islands()] if scene.loop.has_pieces else None
 
 
@@ -378,9 +388,7 @@ _DEGREES = Parsed("DEGREES", read_degrees, "write degrees, such as 30")
 @hardware_options
 @beyond_safe_option
 @figure_option
-@click.option(
-    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
-)
+@code_option
 @verbose_option
 @json_option
 def recommend(
@@ -397,11 +405,11 @@ def recommend(
     The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
     Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
     --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
-    requirements; --grasps does not replace them. So --passive alone recommends the stiffest passive wall, the limit
-    that publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
-    --friction or --max-force, the command also simulates the wall to find limit cycles and saturation; --max-force also
-    limits the force in the code of --code. A hand (--operator-...) is a part of the device, and the command also checks
-    the wall without this hand. The exit code is 1 if no wall exists.
+    requirements; --grasps does not replace them. With --passive as the only requirement, the result is the stiffest
+    passive wall, as in publications on passivity; add --phase-margin 30 --gain-margin 2 to keep the default margins.
+    With --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and
+    saturation; --max-force also limits the force in the code of --code. A hand (--operator-...) is a part of the
+    device, and the command also checks the wall without this hand. The exit code is 1 if no wall exists.
     """
     from zwidth.app.verdict import format_recommendation
 

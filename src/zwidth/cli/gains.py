@@ -1,7 +1,8 @@
-"""Command ``zwidth gains``: convert the gains of a motor controller to a wall and back, and assess the controller.
+"""Command ``zwidth gains``: convert the gains of a motor controller to a wall and back.
 
-The wall has the stiffness K and the virtual damping B. An integrator of the controller is the further feedback of the
-scene.
+The wall has stiffness K and damping B. The kind of a controller is "pid" or "cascade", a position loop with an inner
+velocity loop. The integrator of a controller is the further feedback of a scene. With a device, the command also
+assesses the scene of device and controller.
 """
 
 from __future__ import annotations
@@ -41,24 +42,24 @@ _HELP = {
     "kd": "PID: output per velocity unit, i.e. per (position unit/s).",
 }
 _REQUIRED = {"cascade": ("pos_gain", "vel_gain"), "pid": ("kp",)}
-_DEVICE = {"scene", "device", "mass", "rate", "period"}  # options that imply a device, of which a scene is built
+_DEVICE = {"scene", "device", "mass", "rate", "period"}  # with any of these options, the controller is assessed
 
 
 class _GivenController(NamedTuple):
-    """A controller: its gains by kind ("pid" or "cascade"), wall and feedback, and its scene if a device is given."""
+    """The controller that the options give, either by its gains or by a wall."""
 
-    gains: dict[ControllerKind, dict[str, float]]  # a wall may have gains of both kinds
-    units: dict[ControllerKind, PositionUnit]  # position unit of the gains
+    gains: dict[ControllerKind, dict[str, float]]  # by kind; a wall without feedback has gains of both kinds
+    units: dict[ControllerKind, PositionUnit]  # position unit of the gains, by kind
     wall: VirtualWall
     feedback: Any
-    scene: Any  # None without a device
-    limits: dict[str, tuple[float, float]]  # stable interval of each gain, with the other gains unchanged
+    scene: Any  # device with this controller; None if no device is given
+    limits: dict[str, tuple[float, float]]  # stable interval of each gain if only that gain is changed
     system: UnitSystem
     output: str  # unit of the output of the controller
 
 
 def _add_options(command: Command) -> Command:
-    """Add the options of the gains and of their units to a command."""
+    """Add the options for the gains and their units to a command, and return the command."""
     texts = {
         "--torque-constant": "Torque constant in N m/A, if the output is a current or, with --resistance, a voltage.",
         "--resistance": "Winding resistance in ohm, if the output is a voltage.",
@@ -78,7 +79,7 @@ def _add_options(command: Command) -> Command:
 
 
 def _find_kind(given: dict[str, float]) -> ControllerKind | None:
-    """Return the kind of controller that the names of the given gains imply; None without gains."""
+    """Return the kind of controller that has the given gains, by their names; None if no gains are given."""
     kinds: list[ControllerKind] = [kind for kind in ("cascade", "pid") if given.keys() & set(GAIN_NAMES[kind])]
     if len(kinds) > 1:
         raise click.UsageError("got gains of a cascade and of a PID controller; give only those of one controller")
@@ -89,7 +90,7 @@ def _find_kind(given: dict[str, float]) -> ControllerKind | None:
 
 
 def _read_controller(values: dict[str, Any], system: UnitSystem) -> _GivenController:
-    """Return the controller that the options describe; ``values`` are those of the options of a scene."""
+    """Return the controller that the options describe; ``values`` are the values of the scene options, by path."""
     options = click.get_current_context().params
     given = {name: options[name] for name in _HELP if options[name] is not None}
     kind = _find_kind(given)
@@ -116,7 +117,7 @@ def _read_controller(values: dict[str, Any], system: UnitSystem) -> _GivenContro
     position = None if scene is None else scene.position
 
     def make(**changed: float) -> ControllerParts:
-        """Return the parts of the controller, with some gains changed."""
+        """Return wall, estimates and further feedback for the given gains with those in ``changed`` replaced."""
         rule = options["rule"] or "backward"
         return make_controller(kind, given | changed, position, rule, units[kind], output_unit)
 
@@ -140,7 +141,7 @@ def _read_controller(values: dict[str, Any], system: UnitSystem) -> _GivenContro
 def _list_gains(
     wall: VirtualWall, feedback: Any, units: dict[ControllerKind, PositionUnit], output_unit: float
 ) -> dict[ControllerKind, dict[str, float]]:
-    """Return the gains of a wall by kind of controller; raise `InputError` if no kind of controller renders it."""
+    """Return the gains for a wall, by kind of controller; raise `InputError` if no kind can render the wall."""
     gains, faults = dict[ControllerKind, dict[str, float]](), list[InputError]()
     for kind, unit in units.items():
         try:
@@ -162,7 +163,11 @@ def _format_controller(controller: _GivenController) -> list[str]:
             ends = format_interval(low, high)
             spans.append(f"{name} from {'0' if not low else ends[0]} to {ends[1]} {units[name]}")
         if spans:
-            lines.append(format_line("limits", f"{'; '.join(spans)}; each with the other gains unchanged"))
+            lines.append(
+                format_line(
+                    "limits", f"{'; '.join(spans)}; each with the other gains unchanged; no margins at the ends"
+                )
+            )
     return lines
 
 
@@ -180,8 +185,8 @@ def gains(scene: _GivenController, verbose: bool, as_json: bool, **_: Any) -> No
     Gains are numbers in the units of the controller: a cascade (ODrive, VESC, SimpleFOC) has --pos-gain, --vel-gain and
     --vel-integrator-gain; a PID controller (moteus, SmartKnob, Arduino) has --kp, --ki and --kd. With --mass (or
     --device) and --rate (or --period), or with SCENE.yaml, the command prints the results of `zwidth check` for the
-    controller, and the interval in which each gain is stable. Without gains, it converts --stiffness and
-    --virtual-damping, or the wall of SCENE.yaml, to gains.
+    controller, and for each gain the interval in which the loop is stable. Without gains, the command converts
+    --stiffness and --virtual-damping, or the wall of SCENE.yaml, to gains.
     """
     controller, wall = scene, scene.wall
     result: dict[str, Any] = {

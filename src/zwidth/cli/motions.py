@@ -111,11 +111,12 @@ def simulate(
     A hit starts at the surface of the wall, at a sample, with the given speed; the wall is then unilateral and
     otherwise bilateral. Without --hit, --external-force and --hold the device is released at a depth of 1 mm (1 mrad if
     rotary), or of 50 encoder steps if --resolution is given. The row "in contact" states what zwidth diagnose finds for
-    a device that stays in the wall, which may differ from the simulated motion. With a tool (--tool-mass), the tool is
-    initially at rest at the position 0, --hit is the speed of the device at this position, --hold its distance from the
-    tool, and the row "linear loop" replaces the row "in contact". The options
-    --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options
-    are taken from SCENE.yaml (or from the folder of a run).
+    a device that stays in the wall, which may differ from the simulated motion. With --tool-mass, a virtual coupling
+    to a simulated tool replaces the wall. The tool is initially at rest. The device starts at the position of the tool
+    with the speed --hit, or at the distance --hold from the tool. The row "linear loop", which states whether the
+    coupling is stable, then replaces the row "in contact". The options --stiffness, --mass (or --device) and --rate (or
+    --period) are required. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a
+    run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
     from zwidth.simulation.behavior import describe_ending
@@ -124,7 +125,7 @@ def simulate(
     options = _choose_start(scene, hit, external_force, hold, hardware)
     periods = _choose_length(scene) if duration is None else max(1, round(duration.periods(scene.timing.period)))
     motion = scene.simulate(**options, **hardware, periods=periods)
-    # Diagnose walls only, because zwidth.diagnose does not support a tool.
+    # Skip the diagnosis of a scene with a tool, because zwidth.diagnose supports only walls.
     cause = None if scene.tool is not None else find_cause(scene, **hardware, remedies=False)
     ending, units = describe_ending(motion), scene.unit_system
     load, body = "torque" if units.rotary else "force", "wall" if scene.tool is None else "tool"
@@ -194,14 +195,14 @@ def _choose_start(
         hold = depth
     start: Any = hold or 0.0
     if scene.tool is not None:
-        # Displace the tool in place of a linear system, because such a device starts at 0.
+        # Displace the tool if the device is a linear system, because a linear system always starts at 0.
         linear = isinstance(scene.device, LinearDevice)
         start = {"tool_position": start} if linear else {"position": start, "tool_position": 0.0}
     return {"start_position": start, "external_force": external_force or 0.0}
 
 
 def _get_depth(options: dict[str, Any]) -> float:
-    """Return the initial depth in the wall or distance from the tool, from the arguments of `zwidth.simulate`."""
+    """Return the initial depth in the wall, or distance from the tool, that ``options`` of `zwidth.simulate` set."""
     start = options.get("start_position", 0.0)
     return abs(start.get("position", 0.0) - start["tool_position"]) if isinstance(start, dict) else start
 

@@ -1,6 +1,7 @@
-"""Models of the section ``controller`` of a scene: gains of a PID or cascade controller in the units of the controller.
+"""Models of the section ``controller`` of a scene: the gains of a PID or cascade controller.
 
-The section supplies the keys ``stiffness``, ``virtual_damping`` and ``feedback`` of the scene.
+A cascade is a position loop with an inner velocity loop. The gains have the units of the controller, such as turns.
+They determine the keys ``stiffness``, ``virtual_damping`` and ``feedback`` of the scene.
 """
 
 from __future__ import annotations
@@ -29,32 +30,32 @@ from zwidth.model.parameter_paths import spell_part
 from zwidth.units.quantities import POSITIVE
 
 Positive = Annotated[float, Quantity(allowed=POSITIVE)]
-DERIVED = ("stiffness", "virtual_damping", "feedback")  # keys of a scene that its controller supplies
+DERIVED = ("stiffness", "virtual_damping", "feedback")  # keys of a scene whose values follow from its controller
 
 
 class ControllerSection(Strict):
-    """Base of the models of controllers."""
+    """Base class of the models of PID and cascade controllers."""
 
     name: ClassVar[ControllerKind]
 
     rule: IntegrationRule = "backward"
-    """Rule of integration: forward for ODrive, trapezoidal for SimpleFOC."""
+    """Rule by which the controller computes its integral: forward in ODrive, trapezoidal in SimpleFOC."""
 
     units: PositionUnit | None = None
     """Position unit of the gains. Default: turns for a cascade, rad for a PID controller; m for linear devices."""
 
     output_unit: Positive | None = None
-    """Torque in N m (linear devices: force in N) per unit of output. Default: 1."""
+    """Torque in N m (linear devices: force in N) per unit of the controller's output. Default: 1."""
 
     torque_constant: Positive | None = None
-    """Torque constant in N m/A, if the output is a current or, with a resistance, a voltage."""
+    """Torque constant of the motor in N m/A, if the output of the controller is a current or a voltage."""
 
     resistance: Positive | None = None
-    """Winding resistance in ohm, if the output is a voltage."""
+    """Winding resistance of the motor in ohm, if the output of the controller is a voltage."""
 
     @cached_property
     def parts(self) -> ControllerParts:
-        """Wall and feedback of the controller, without a position estimate."""
+        """Wall and further feedback that follow from the gains; the position estimate is a key of the scene."""
         gains = {name: getattr(self, name) for name in GAIN_NAMES[self.name]}
         output_unit = find_output_unit(self.output_unit, self.torque_constant, self.resistance)
         units = find_units(self.name, self.units, get_system().rotary)
@@ -74,11 +75,11 @@ class PidSection(ControllerSection, noun="a PID controller"):
 
     kind: Literal["pid"]
     kp: Number
-    """Output per position unit."""
+    """Proportional gain: output per position unit."""
     ki: Number = 0.0
-    """Output per (position unit times s)."""
+    """Integral gain: output per (position unit times s)."""
     kd: Number = 0.0
-    """Output per velocity unit, i.e. per (position unit/s)."""
+    """Derivative gain: output per velocity unit, i.e. per (position unit/s)."""
 
 
 class CascadeSection(ControllerSection, noun="a cascade"):
@@ -90,9 +91,9 @@ class CascadeSection(ControllerSection, noun="a cascade"):
     pos_gain: Number
     """Gain of the position loop in 1/s."""
     vel_gain: Number
-    """Output per velocity unit, in N m/(turn/s) for ODrive."""
+    """Gain of the velocity loop: output per velocity unit, in N m/(turn/s) for ODrive."""
     vel_integrator_gain: Number = 0.0
-    """Output per position unit, in N m/turn for ODrive."""
+    """Integral gain of the velocity loop: output per position unit, in N m/turn for ODrive."""
 
 
 _SECTIONS: dict[str, type[ControllerSection]] = {"cascade": CascadeSection, "pid": PidSection}
@@ -113,9 +114,9 @@ ControllerField = Annotated[
 
 
 def derive_keys(raw: dict[str, Any]) -> dict[str, Any]:
-    """Return the mapping of a scene with its controller replaced by the keys that the controller supplies.
+    """Return the mapping of a scene with the keys in `DERIVED` in place of the key ``controller``.
 
-    The mapping is returned unchanged if the controller is invalid, or if one of these keys is given too, because the
+    The mapping stays unchanged if the controller is invalid, or if it also contains a key in `DERIVED`, because the
     validation of the scene then reports the problem.
     """
     if raw.get("controller") is None or raw.keys() & set(DERIVED):
@@ -131,13 +132,13 @@ def derive_keys(raw: dict[str, Any]) -> dict[str, Any]:
     if parts.feedback is not None:
         derived["feedback"] = {"kind": "integral", **spell_part(parts.feedback)}
         if raw.get("position") is not None:
-            # The integral of a PID controller contains the position estimate, as its other terms do.
+            # Integrate the position estimate, not the measured position, because all terms of a PID controller use it.
             derived["feedback"].setdefault("position", 1.0)
     return {**{name: value for name, value in raw.items() if name != "controller"}, **derived}
 
 
 def find_second_wall(raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Yield a problem for each key of a scene that its controller supplies, if both are given."""
+    """Yield a problem for each key in `DERIVED` that is given together with a controller."""
     for name in DERIVED if raw.get("controller") is not None else ():
         if raw.get(name) is not None:
             allowed = "the gains of the controller determine it"

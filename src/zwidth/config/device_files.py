@@ -1,4 +1,8 @@
-"""Devices in files of their own: the value of the key ``device`` of a configuration, for the option ``--device``."""
+"""Read the value of the option ``--device`` of a command: a description of a device, or the name of a device file.
+
+A device file (YAML or JSON) describes one device, with the keys below ``device`` in a configuration file. A description
+is the name of a published device, a transfer function, or the name of a file with a measured frequency response.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ _SUFFIXES = (".yaml", ".yml", ".json")
 
 
 def _refuse_configuration(raw: Any) -> Any:
-    """Return the content of a file of a device unchanged; raise a problem if it is a whole configuration."""
+    """Return the content of a device file unchanged; raise an error if it is a complete configuration file."""
     if isinstance(raw, dict) and "version" in raw:
         allowed = "a file for --device has the keys of one device"
         raise problem("got a whole configuration", allowed, "give its name without --device")
@@ -29,23 +33,23 @@ def _refuse_configuration(raw: Any) -> Any:
 
 
 class _DeviceFile(RootModel[Annotated[DeviceForm, BeforeValidator(_refuse_configuration)]]):
-    """A file whose content is the value of the key ``device``."""
+    """Pydantic model of the content of a device file."""
 
 
 def read_device_option(
     text: str, sampled: Any = None, *, rotary: bool = False
 ) -> PublishedDevice | Device | LinearDevice | MeasuredDevice:
-    """Return the device that the text of an option ``--device`` describes.
+    """Return the device that the value of the option ``--device`` describes.
 
     Args:
-        text: the name of a YAML file with the keys of a device, such as ``mass_matrix`` or ``model``, and file names
-            relative to it; or a text that `zwidth.model.devices.read_device` accepts.
+        text: value of the option: the name of a device file, or a description that `zwidth.model.devices.read_device`
+            accepts. Names of other files in a device file are relative to the folder of the device file.
         sampled: sampling period in s for a transfer function in z; None for a transfer function in s.
-        rotary: True if a transfer function is that of a rotary device, because other options have rotary units.
+        rotary: True if other options have rotary units; a device given by a transfer function is then rotary.
 
     Raises:
-        InputError: the text is none of these, or ``sampled`` is given for a device that is not a transfer function.
-        ConfigError: the file cannot be read or has faults.
+        InputError: ``text`` describes no device, or ``sampled`` is given for a device that is not a transfer function.
+        ConfigError: the device file cannot be read or is invalid.
     """
     if text.endswith(MODEL_SUFFIXES):
         raise InputError(

@@ -379,7 +379,8 @@ def find_kind(
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", kinds, f"write {example}")
     if "kind" not in raw:
-        error = problem("missing", kinds, f"add 'kind: {next(iter(models))}'")
+        shown = next((name for name in models if f"kind: {name}" in example), next(iter(models)))
+        error = problem("missing", kinds, f"add 'kind: {shown}'")
     elif isinstance(kind := raw["kind"], str) and kind in models:
         return models[kind]
     else:

@@ -1,8 +1,8 @@
-"""Models of devices with several joints: a mass matrix, or a model file of the simulator MuJoCo.
+"""Pydantic models of arms with several joints in configurations, given by a mass matrix or by a MuJoCo model file.
 
-Both sections describe an arm with several joints in one pose, and the direction along which a wall acts on one point of
-the arm. `MujocoSection` is converted to a `MassMatrixSection` when it is read, so that a saved configuration contains
-the matrices instead of the name of the model file.
+The arm is in one *pose*, a position of every joint, and the wall acts on one point of the arm along one direction. Each
+class describes a *section*, the mapping of one arm. When a configuration is read, a `MujocoSection` is converted to a
+`MassMatrixSection`, so that a saved configuration contains the matrices instead of the name of the model file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from zwidth.model.mujoco_model import linearize_model
 _ENTRY: dict[str, Any] = {"type": ["number", "string"]}
 _LIST: dict[str, Any] = {"type": "array", "items": _ENTRY, "minItems": 1}
 _ROWS: dict[str, Any] = {"type": "array", "items": {"type": "array", "items": _ENTRY}, "minItems": 1}
-# The functions of `zwidth.model` check the values of these fields, because the size of an array depends on the others.
+# These types accept every value, because `from_mass_matrix` checks the arrays together: their sizes must agree.
 _Matrix = Annotated[Any, WithJsonSchema(_ROWS)]
 _OfJoints = Annotated[Any, WithJsonSchema({"anyOf": [_ENTRY, _LIST, _ROWS]})]
 _Direction = Annotated[
@@ -42,15 +42,15 @@ class MassMatrixSection(PartSection, noun="a device with joints"):
     """A device with several joints in one pose, given by its mass matrix."""
 
     mass_matrix: _Matrix
-    """Symmetric mass matrix of the joints, a list of rows, in kg m^2 for hinges and kg for slides, or with units."""
+    """Symmetric mass matrix of the joints: a list of rows, in kg m^2 (hinges) and kg (slides), or with units."""
 
     damping: _OfJoints = 0.0
-    """Viscous damping of the joints in N m s/rad (hinges) or N s/m (slides), or with units: one number, a list with one
-    per joint, or a matrix."""
+    """Viscous damping of the joints in N m s/rad (hinges) or N s/m (slides), or with units: one number for
+    all joints, a list with one number per joint, or a matrix."""
 
     jacobian: _Matrix | None = None
-    """Jacobian of the point on which the wall acts: one row per axis, one column per joint; zeros in the column of a
-    joint without motor. Default: the direction is in joint coordinates."""
+    """Jacobian of the point on which the wall acts: one row per axis, one column per joint. The column of a joint
+    without motor contains zeros. Default: the identity matrix; the direction is then in joint coordinates."""
 
     direction: _Direction | None = None
     """Direction of the wall: x, y or z, or a vector with one component per row of the Jacobian. Required unless the
@@ -58,14 +58,14 @@ class MassMatrixSection(PartSection, noun="a device with joints"):
 
     stiffness: _OfJoints = 0.0
     """Stiffness of springs from the joints to ground in N m/rad or N/m, in the same form as the damping. A spring k
-    between two coordinates has the matrix [[k, -k], [-k, k]]."""
+    between two joint coordinates has the matrix [[k, -k], [-k, k]]."""
 
     rotary: Rotary = Field(default_factory=read_rotary)
-    """True if the direction is an axis of rotation."""
+    """True if the wall acts on the rotation about the direction, as for a knob."""
 
     @cached_property
     def instance(self) -> Device | LinearDevice:
-        """The device along the direction: a `Device` if it is a rigid mass, otherwise a `LinearDevice`."""
+        """The device that the wall acts on: a `Device` if the arm moves like one mass, otherwise a `LinearDevice`."""
         given = {name: getattr(self, name) for name in type(self).model_fields}
         return from_mass_matrix(**{**given, "rotary": bool(self.rotary)})
 
@@ -77,21 +77,21 @@ class MujocoSection(Strict, noun="a device from a MuJoCo model"):
     """Name of the model file (MJCF .xml, .urdf or .mjb), relative to the configuration."""
 
     site: str
-    """Name of the site on which the wall acts; of a body in a model without sites."""
+    """Name of the site on which the wall acts. In a model without sites: name of the body on which the wall acts."""
 
     direction: _Direction
     """Direction of the wall in world coordinates: x, y or z, or a vector."""
 
     pose: _Pose | None = None
-    """Positions of joints by name, such as {elbow: 60 deg}; or a list of all positions in rad and m or with units; or
-    the name of a keyframe. Default: the reference pose of the model."""
+    """Positions of the joints: a mapping such as {elbow: 60 deg}; a list of all positions, in rad and m or with units;
+    or the name of a keyframe, a pose in the model file. Default: the reference pose of the model."""
 
     rotary: Rotary = Field(default_factory=read_rotary)
-    """True for a wall that acts on the rotation about the direction, such as a knob."""
+    """True if the wall acts on the rotation about the direction, as for a knob."""
 
     @cached_property
     def joints(self) -> dict[str, Any]:
-        """The keys of a `MassMatrixSection` with the matrices of the model."""
+        """The same arm described by its mass matrix: keys and values of a `MassMatrixSection`."""
         matrices = linearize_model(find_file(self.model), self.site, self.pose, rotary=bool(self.rotary))
         given = {name: values.tolist() for name, values in matrices._asdict().items()}
         return {**given, "direction": self.direction, **({"rotary": True} if self.rotary else {})}
@@ -101,5 +101,5 @@ class MujocoSection(Strict, noun="a device from a MuJoCo model"):
             from_mass_matrix(**self.joints)
         except InputError as error:
             path, fault = parse_input_error(error)
-            # Report other problems, such as a missing package, with the path of the section.
+            # Report a problem that concerns no field, such as a missing package, for the whole section: its path is ().
             yield (path if path[0] in type(self).model_fields else ()), fault

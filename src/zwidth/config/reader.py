@@ -107,8 +107,8 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
         if "mass_matrix" in data or "model" in data:
-            # Skip all values of an arm except ``rotary``, because joints may have positions in degrees and damping in
-            # N m s/rad even if the wall acts on a linear motion.
+            # For an arm, return its key ``rotary``. Ignore the units of its joints, such as N m s/rad, because the
+            # wall may act on a linear motion of an arm with rotary joints.
             return data.get("rotary") is True
         return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
     if isinstance(data, list):

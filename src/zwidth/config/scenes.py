@@ -193,7 +193,7 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
 
     controller: ControllerField | None = Field(default=None, exclude=True)
-    """Gains of a motor controller, in place of stiffness, virtual damping and feedback."""
+    """Gains of a motor controller, in place of the keys stiffness, virtual_damping and feedback."""
 
     velocity: SimulatedVelocityField | None = None
     """Velocity estimate. Default: the difference of two samples."""

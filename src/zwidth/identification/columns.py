@@ -51,7 +51,7 @@ _COARSEST = 1.1  # rad or m; largest accepted encoder step (6 steps per turn), b
 class LoggedMotion:
     """Time, position and force of one log in SI units, as arrays with one entry per row of the file.
 
-    NaN marks a cell without a number. Comparisons of two logs ignore the arrays.
+    Cells of the file without a number are NaN. Comparison of two logs with ``==`` ignores the arrays.
 
     Attributes:
         time: times in s; None if the period replaces them.

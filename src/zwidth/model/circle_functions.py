@@ -24,7 +24,7 @@ _UNDAMPED = 8.0 * np.finfo(float).eps
 
 
 class Jet(NamedTuple):
-    """The value of a complex function of w, or of another variable, and its derivative."""
+    """Value and derivative of a complex function of one variable, usually the angle w."""
 
     value: Array
     slope: Array  # derivative with respect to the variable

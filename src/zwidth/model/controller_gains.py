@@ -256,9 +256,8 @@ def cascade_gains(
         output_unit: force or torque per unit of output, see `cascade`.
 
     Returns:
-        ``pos_gain = K/B``, ``vel_gain = B`` and ``vel_integrator_gain`` in the units of the controller. The integrator
-        must be that of a scene whose further feedback contains the same ``pos_gain``, such as the scene of
-        `zwidth.Scene.recommend`.
+        ``pos_gain = K/B``, ``vel_gain = B`` and ``vel_integrator_gain`` in the units of the controller. The
+        integrator of the scene must contain the same ``pos_gain``. `zwidth.Scene.recommend` returns such a scene.
 
     Raises:
         InputError: if the damping is 0, because a cascade renders a spring only together with a damper.
@@ -302,7 +301,7 @@ def find_gains(
     if feedback is not None:
         integrated = isinstance(feedback, IntegralFeedback) and feedback.is_cascade == is_cascade
         if is_cascade and integrated:
-            # Compare pos_gain B with K, because B may be small. Six digits of K and B agree to 1e-5.
+            # Compare pos_gain B with K, because B may be small; K and B may be rounded to six digits.
             integrated = abs(feedback.position / feedback.velocity * B - K) <= 1e-5 * abs(K)
         if not integrated or (not is_cascade and feedback.velocity):
             allowed = "the integrator of a cascade with pos_gain = K/B" if is_cascade else "an integral of the position"
@@ -314,7 +313,7 @@ def find_gains(
 
 
 GAIN_NAMES: dict[str, tuple[str, ...]] = {"pid": PidGains._fields, "cascade": CascadeGains._fields}
-"""Names of the gains of each kind of controller."""
+"""Names of the gains of the two kinds of controllers, "pid" and "cascade"."""
 
 
 def find_output_unit(output_unit: float | None, torque_constant: float | None, resistance: float | None) -> float:
@@ -363,6 +362,6 @@ def make_controller(
     units: PositionUnit,
     output_unit: float,
 ) -> ControllerParts:
-    """Return the parts of a scene for a controller of a kind, from its gains by name; see `pid` and `cascade`."""
+    """Convert the gains of a controller, given by name, to parts of a scene; see `pid` and `cascade`."""
     options: Any = {"position": position, "rule": rule, "units": units, "output_unit": output_unit}
     return cascade(**gains, **options) if kind == "cascade" else pid(**gains, **options)

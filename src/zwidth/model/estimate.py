@@ -49,10 +49,10 @@ class Estimate:
     def list_window_zeros(self) -> np.ndarray:
         """Return the offsets 1 - z of the zeros of (z^n - 1)/(z - 1), for a window of n periods.
 
-        They are the n-th roots of 1, without z = 1.
+        These zeros are the n-th roots of 1, except z = 1.
         """
         angles = 2.0 * np.pi * np.arange(1, self.window) / max(self.window, 1)
-        # Set the offset of z = -1 to exactly 2, so that it is equal to that of a zero of the device at z = -1.
+        # Set the offset of z = -1 to exactly 2, so that it equals the offset of a zero of the device at z = -1.
         return np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
 
     @property

@@ -159,7 +159,7 @@ class IntegralFeedback(Part):
 
     @property
     def is_cascade(self) -> bool:
-        """True if the integrand contains position and velocity, as that of `zwidth.cascade`, whose pos_gain is K/B."""
+        """True if the integrand is a weighted sum of position and velocity, as in a cascade (`zwidth.cascade`)."""
         return bool(self.position) and bool(self.velocity)
 
     def match_wall(self, stiffness: float, virtual_damping: float) -> Self:

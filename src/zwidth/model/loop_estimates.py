@@ -46,15 +46,16 @@ class LoopEstimates:
 
     @property
     def of_tool(self) -> Estimate:
-        """The estimate V_t of the velocity of a simulated tool, whose position is known without a filter.
+        """The velocity estimate V_t of a simulated tool, whose input is the exact position of the tool.
 
-        It is the velocity estimate of the scene, or the backward difference if an observer estimates the velocity.
+        V_t is the velocity estimate of the scene, or the backward difference if an observer estimates the velocity of
+        the device.
         """
         return Estimate() if self.structure == "common" else self.velocity
 
     @property
     def uses_velocity(self) -> bool:
-        """True if V x is needed by itself: an observer estimates it, or it is an input of the further feedback."""
+        """True if the velocity V x of the device is needed separately, by the further feedback or from an observer."""
         weights = None if self.feedback is None else self.feedback.weights
         return self.structure == "common" or (weights is not None and bool(np.any(weights.velocity != 0)))
 

@@ -117,7 +117,7 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
     owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}
-    # The dampings of joints are no fields, because `JointDevice` computes its system from them.
+    # Add the paths of joint dampings, which are not fields of the class `JointDevice`.
     owners |= {path: ("joints", path) for path in getattr(scene.device, "joint_dampings", ())}
     changed: dict[str, dict[str, Any]] = {}
     for path, value in changes.items():

@@ -22,8 +22,8 @@ class Timing(Part):
         period: sampling period T in s, > 0. Pass either ``period`` or ``rate``.
         delay: delay t_d from a sample to the start of its force in s, >= 0, or a text in periods, "1.5 periods". It
             need not be a multiple of the period. If the period changes, a delay in periods keeps its number of periods.
-            Derivatives by JAX with respect to such a delay are per period: in a gradient, this number is
-            ``gradient.timing.span.value``.
+            A JAX derivative with respect to such a delay is per period of delay; in the gradient of a scene, it is
+            the number ``gradient.timing.span.value``.
         rate: sampling rate 1/T in Hz, > 0.
 
     Example:
@@ -59,7 +59,7 @@ class Timing(Part):
         """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""
         text = super().__repr__()
         if not self.in_periods or self.delay is self._periods:
-            # A derivative is no delay, and `_unflatten` then stores the same object in both attributes.
+            # If JAX stores a derivative in place of the delay, `_unflatten` assigns the same object to both attributes.
             return text
         return text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
@@ -72,8 +72,7 @@ class Timing(Part):
         timing, (period, delay) = object.__new__(cls), children
         values = {"period": period, "delay": delay, "rate": None}
         if structure:
-            # Keep the delay in periods if JAX passes objects that are not numbers and cannot be multiplied; and if a
-            # number is out of range, because it is then a derivative, and no product of derivatives is a delay.
+            # Convert the delay to seconds unless JAX passes derivatives, or objects that cannot be multiplied.
             with suppress(TypeError):
                 values["delay"] = delay if _is_derivative(period, delay) else delay * period
             values |= {"_periods": delay, "in_periods": True}
@@ -106,7 +105,7 @@ class Timing(Part):
 
 
 def _is_derivative(period: Any, count: Any) -> bool:
-    """Return whether a period or a number of periods is out of range, so that both are derivatives of a function."""
+    """Return True if period or number of periods is out of range: JAX then stores derivatives in a `Timing`."""
     if is_traced(period, count) or np.ndim(period) or np.ndim(count):
         return False
     return float(period) <= 0 or float(count) < 0

@@ -32,7 +32,7 @@ class ToolResponse(NamedTuple):
 
 
 class ToolStep(NamedTuple):
-    """One integration step ``w = decay w - spring y + gain f; y = y + w`` of a tool with the increment w per step."""
+    """One step of a tool at the position y, which changes by w: ``w = decay w - spring y + gain f; y = y + w``."""
 
     decay: Any
     spring: Any
@@ -51,8 +51,8 @@ class Tool(Part):
     tool in the same period, without delay, because the program also simulates the tool. The force acts on the device
     with the delay of the scene.
 
-    If the scene has a position estimate P, the coupling uses P x instead of x, and the exact y. If an observer or PLL
-    estimates the velocity v_x, then v_y is the backward difference of y. Further feedback acts on the device alone.
+    If the scene has a position estimate P, the coupling uses P x in place of x. If an observer or PLL estimates the
+    velocity v_x, then v_y is the backward difference of y. Further feedback acts on the device only.
 
     Args:
         mass: mass M of the tool in kg, > 0.
@@ -116,7 +116,7 @@ class Tool(Part):
         return ToolResponse(mass / self.mass, 1, p * 0.0 + 1.0, p + q, q)
 
     def compute_step(self, mass: Any, period: Any) -> ToolStep:
-        """Return the integration step of the tool for forces f in units of m/T^2 times the unit of position.
+        """Return the integration step of the tool in normalized units: f is the force multiplied by T^2/m.
 
         Args:
             mass: m in kg, the unit of mass of the scene.

@@ -51,7 +51,7 @@ def newton(
         high: upper end of the bracket.
         start: starting value.
         steps: largest number of steps.
-        close: magnitude of a step, relative to the zero, after which the search stops.
+        close: size of a step, relative to the zero, below which the search stops.
 
     Returns:
         The zero, and the magnitude of the last step.
@@ -79,7 +79,8 @@ def illinois(
 ) -> tuple[Array, Array]:
     """Find the zero of a function in a bracket by the Illinois method; a bisection replaces a step out of the bracket.
 
-    The method takes the zero of the secant between both ends. The value at an end that stays twice in a row is halved.
+    Each step replaces one end by the zero of the secant. If the other end stays the same twice in a row, the method
+    halves the function value at this end, which prevents slow convergence.
 
     Args:
         function: a continuous function.
@@ -88,7 +89,7 @@ def illinois(
         first: values at ``low``.
         last: values at ``high``, of the opposite sign.
         steps: largest number of steps.
-        close: magnitude of a step, relative to the zero, after which the search stops.
+        close: size of a step, relative to the zero, below which the search stops.
 
     Returns:
         The zero, and the magnitude of the last step.

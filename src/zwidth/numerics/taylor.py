@@ -223,7 +223,7 @@ def differentiate_implicitly(equations: Sequence[Taylor], values: Sequence[float
         values: values of the unknowns.
 
     Returns:
-        Each unknown; the derivatives are NaN if the system is singular.
+        The unknowns, in order; their derivatives are NaN if the system is singular.
     """
     count = len(equations)
     slopes = np.array([each.first for each in equations])
@@ -241,7 +241,7 @@ def differentiate_implicitly(equations: Sequence[Taylor], values: Sequence[float
 
 
 def replace_derivatives(results: list[Taylor], others: list[Taylor], k: int) -> None:
-    """Replace the derivatives of each result in the variable with the index k by those of ``others``."""
+    """Replace, in each result, the derivatives with respect to variable k by those of ``others``."""
     for result, other in zip(results, others, strict=True):
         result.first[k] = other.first[k]
         if result.second is not None and other.second is not None:

@@ -1,7 +1,7 @@
-"""Draw the largest stable stiffness of the environment of admittance displays over virtual mass or virtual damping.
+"""Draw the largest stable stiffness of the environment of admittance displays.
 
-M and D are the virtual mass and the virtual damping of a display; K and B are the stiffness and the damping of the
-environment.
+A display is a robot that moves like a virtual mass M with virtual damping D. The environment is a spring K and a damper
+B between the robot and ground. d is the delay in sampling periods.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from zwidth.plotting import grid, style
 from zwidth.plotting.table import SI_COLUMNS, Table, draws_tables, in_order, select
 from zwidth.units.formatting import short, with_unit
 
-# Column, symbol and name of both parameters of the horizontal axis, and their unit for linear devices.
+# Parameters that the horizontal axis can show: column of the table, symbol, name, and unit for linear devices.
 _MASS = ("virtual_mass_kg", "M", "virtual mass", "kg")
 _DAMPING = ("virtual_damping_N_s_per_m", "D", "virtual damping", "N s/m")
 _ENVIRONMENT = "environment_damping_N_s_per_m"
@@ -24,8 +24,8 @@ _ENVIRONMENT = "environment_damping_N_s_per_m"
 def draw_environment_limits(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the largest stable stiffness of the environment over the virtual mass, with one curve per virtual damping.
 
-    If the table contains a single virtual mass, the horizontal axis is the virtual damping. Line styles distinguish
-    delays and dampings of the environment.
+    If the table contains a single virtual mass, the horizontal axis is the virtual damping. Each combination of delay
+    and damping of the environment has its own line style.
 
     Args:
         table: Columns of an admittance study.
@@ -72,13 +72,13 @@ def draw_environment_limits(table: Table, axes: style.AnyAxes | None = None) -> 
 
 
 def _spell(value: float, unit: str) -> str:
-    """Return a value with three digits and its unit, for legends."""
+    """Return a value with three digits and its unit as text, for the legend."""
     return with_unit(value, style.units()[unit], 3)
 
 
 def _name_case(case: tuple[float, float], cases: list[tuple[float, float]]) -> str:
-    """Return the legend entry of a delay and a damping of the environment, without values that all cases share."""
+    """Return the legend entry of a case (d, B), without d or B if all cases have the same value."""
     varied: list[Any] = [len(set(column)) > 1 for column in zip(*cases, strict=True)]
-    words = [f"delay {short(case[0])} periods"] if varied[0] else []
+    words = [f"delay {short(case[0])} period{'' if case[0] == 1 else 's'}"] if varied[0] else []
     words += [f"$B$ = {_spell(case[1], 'N s/m')}"] if varied[1] else []
     return ", ".join(words)

@@ -133,7 +133,7 @@ def _read_responses(table: Table) -> list[Any]:
 
 @draws_tables
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the position and the wall force of each motion over time; thin lines show positions of tip, hand and tool.
+    """Draw the position and the wall force of each motion over time; thin lines show tip, hand and tool.
 
     If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
     without bound is clipped at eight times the largest value of the smallest motion.

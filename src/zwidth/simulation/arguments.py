@@ -36,8 +36,8 @@ JITTER_BYTES = 20 * 8  # memory per instant for the durations between jittered s
 DRAWN_BYTES = 4 * 8  # memory per period for noise, and again for external forces
 MOST_BYTES = 4 << 30  # largest estimate that is accepted: 4 GiB
 
-DEFAULT_PERIODS = 1000  # sampling periods
-MAX_PERIODS = 10**9  # sampling periods; the memory limits recorded simulations to fewer
+DEFAULT_PERIODS = 1000  # default number of simulated periods
+MAX_PERIODS = 10**9  # largest number of simulated periods; memory limits recorded simulations to fewer
 STARTS = ("start_position", "start_velocity")  # arguments with one initial value per body
 ARGUMENTS = {
     name: (FIELDS[name].unit, ANY if FIELDS[name].allowed == ANY else NOT_NEGATIVE)
@@ -74,7 +74,7 @@ def find_system(scenes: list[Any]) -> UnitSystem:
 
 
 def count_periods(scenes: list[Any], periods: Any, duration: Any) -> int:
-    """Return the number of sampling periods of a simulation, from ``periods`` or ``duration``; 1000 without both."""
+    """Return the number of sampling periods of a simulation, from ``periods`` or ``duration``; 1000 by default."""
     if duration is None:
         return check_integer("periods", DEFAULT_PERIODS if periods is None else periods, 1, MAX_PERIODS)
     if periods is not None:
@@ -245,7 +245,7 @@ def read_arguments(
 
 
 def refuse_unsupported(scenes: list[Any], contact: str, law: TracedLaw | None) -> None:
-    """Raise `InputError` if the simulation does not support the tool of a scene, because of the contact or the law."""
+    """Raise `InputError` if a scene has a tool that cannot be simulated with the contact or the force law."""
     for scene in scenes:
         if scene.tool is None:
             continue

@@ -102,7 +102,7 @@ def control(
         states = states._replace(position=filtered)
         estimated_from = jnp.where(params.filtered_input, position, measured)
     if options.tool and not options.filters_tool:
-        # Compute one estimate of the velocity from the distance.
+        # Estimate the relative velocity from the distance between tool and device.
         rest = _estimate_velocity(params.estimator, controller.positions, states.velocity, k, 0.0 * measured)[0]
         position = estimated_from = _find_distance(params, options, controller, k, measured, rest)
     positions = write(controller.positions, estimated_from, k & (len(controller.positions) - 1))
@@ -113,7 +113,7 @@ def control(
         states = states._replace(velocity=filtered)
     estimates, tool_positions = jnp.stack([measured, position, velocity]), controller.tool_positions
     if options.filters_tool:
-        # Subtract an estimate of the velocity of the tool from that of the device.
+        # Estimate the velocities of tool and device separately, and subtract them.
         estimate = params.tool_estimator, tool_positions, states.tool, k
         rest = velocity - _estimate_velocity(*estimate, position)[0]
         distance = _find_distance(params, options, controller, k, position, rest)
@@ -154,14 +154,14 @@ def control(
 def _estimate_velocity(
     estimator: Estimator, positions: Array, state: Array, k: Array, newest: Array
 ) -> tuple[Array, Array]:
-    """Return a linear velocity estimate at sample k, with the position ``newest``, and the next state of its filter."""
+    """Return a linear velocity estimate at sample k and the next state of its filter. ``newest`` is the input."""
     window = estimator.window
     difference = (newest - look_back(positions, k, window)) / jnp.maximum(window, 1)
     return _filter(estimator.filter, state, jnp.where(window > 0, difference, newest))
 
 
 def _integrate_tool(step: ToolStep, tool: Array, k: Array, force: Array) -> tuple[Array, Array]:
-    """Return the state of the tool after period k, and the position from which the force of the coupling follows."""
+    """Return the state of the tool after period k, and the position of the tool that determines the coupling force."""
     due = k % step.every == 0
     change = jnp.where(due, _step_freely(step, tool) + step.gain * force, 0.0)
     after = jnp.stack([tool[0] + change, jnp.where(due, change, tool[1])])
@@ -169,7 +169,7 @@ def _integrate_tool(step: ToolStep, tool: Array, k: Array, force: Array) -> tupl
 
 
 def _step_freely(step: ToolStep, tool: Array) -> Array:
-    """Return the change of the position of the tool in one step without the force of the coupling."""
+    """Return the change of the position of the tool in one step if the coupling exerts no force."""
     return step.decay * tool[1] - step.spring * tool[0]
 
 
@@ -194,7 +194,7 @@ def _find_distance(
     solved = tool.implicit & (k % tool.every == 0)
     distance = position - (controller.tool[0] + jnp.where(solved, _step_freely(tool, controller.tool), 0.0))
     if options.foaw or options.law is not None:
-        # Scenes with a nonlinear coupling have tools integrated by the semi-implicit Euler method only.
+        # With FOAW or a force law, all tools use the semi-implicit Euler method: e does not depend on f.
         return distance
     gain, direct = jnp.where(solved, tool.gain, 0.0), estimator.filter.D / jnp.maximum(estimator.window, 1)
     return (distance - gain * params.beta * rest) / (1.0 + gain * (params.alpha + params.beta * direct))
@@ -258,7 +258,7 @@ def start_controller(
         tool_past = place - back[:, None] * tool_speed
         if not options.filters_tool:
             past, speed = past - tool_past, v - tool_speed
-        # The implicit Euler method makes a step before the force at sample 0 is computed, so start one step earlier.
+        # The implicit Euler method makes a step before it computes the force at sample 0, so start one step earlier.
         step = params.tool.every * tool_speed
         tool = np.stack([place - np.where(params.tool.implicit, step, 0.0), step])
     filtered, position, change = _settle(params.position, past[0], v)

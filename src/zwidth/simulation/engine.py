@@ -137,7 +137,7 @@ def initial_state(params: Parameters, options: Options, inputs: ExternalInputs, 
     body[:count], body[first : first + count] = inverse @ inputs.positions, inverse @ inputs.velocities
     x, v = body[0], body[first]
     controller, zero = start_controller(params, options, (x, v), inputs.tool, rings), np.zeros(x.size)
-    count += options.tool  # the statistics include the position of the tool
+    count += options.tool  # one more row of statistics for the position of the tool
     far, turns = np.full((1 + SEGMENTS, 2, count, x.size), -np.inf), np.zeros((1 + SEGMENTS, x.size))
     summary = Summary(zero, zero + np.nan, zero, far, turns, np.full((2, x.size), np.nan))
     return State(BodyState(body, np.sign(inputs.velocities[0])), controller, np.zeros((4, x.size)), summary)

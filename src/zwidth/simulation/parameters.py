@@ -64,7 +64,7 @@ class Options(NamedTuple):
 
     @property
     def filters_tool(self) -> bool:
-        """True if the velocity of the tool has a separate estimate (T9)."""
+        """True if the velocities of tool and device are estimated separately (docs/theory/simulation.md, T9)."""
         return self.tool and (self.position or self.feedback)
 
     record: bool  # readings and frames are recorded
@@ -89,7 +89,7 @@ class ExternalInputs(NamedTuple):
     velocities: np.ndarray  # initial velocities, (bodies, batch)
     noise: np.ndarray | None  # errors of the measured positions in m, (periods, batch); None without noise
     history: np.ndarray | None  # external force per period, (periods, batch); None without a history
-    tool: np.ndarray  # initial position of the tool (NaN: that of the device) and its change per period, (2, batch)
+    tool: np.ndarray  # initial position of the tool (NaN: position of the device), and change per period; (2, batch)
     durations: np.ndarray | None  # durations of the pieces, (periods, substeps, pieces, batch); None without jitter
     instants: np.ndarray | None  # instants of the samples in periods, (periods + 1, batch); None without jitter
     period: np.ndarray  # sampling period, in s
@@ -211,7 +211,7 @@ def build_program(
         velocities: velocity estimate of each scene, used in place of that in ``programs``, because it may be FOAW,
             which is not linear.
         which: index of the scene of each simulation.
-        filters_tool: whether the velocity of a tool has a separate estimate.
+        filters_tool: True if the velocities of tool and device are estimated separately.
     """
     none = Estimate(0, 0.0)
     feedbacks = [each.feedback for each in programs]

@@ -121,8 +121,8 @@ def simulate(
 
     Raises:
         InputError: an argument is invalid; friction with a pole of more than 64 rad per period; JAX cannot trace the
-            law, or the law keeps values between calls; a scene has a tool, which the contact, the law or the velocity
-            estimate excludes.
+            law, or the law keeps values between calls; a scene has a tool together with a contact, a law or a
+            velocity estimate that does not allow a tool.
         ResourceError: the recorded or random numbers need more than 4 GiB.
 
     Numerics:

@@ -141,7 +141,7 @@ def _find_zeros(loop: OpenLoop, function: RealFunction) -> np.ndarray:
 
 
 def _list_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices along the last axis at which a mask is True, and a mask of the valid ones.
+    """Return the indices along the last axis at which a mask is True, padded, and True for valid ones.
 
     The result has as many indices per row as the row with the most True entries needs.
     """

@@ -1,7 +1,8 @@
-"""Study of the environments in which admittance displays are stable, over grids of virtual mass and damping.
+"""Study of the environments in which admittance displays are stable.
 
-An admittance display is a robot that measures the contact force and moves like a virtual mass M with a virtual damping
-D. The environment, or the hand of a user, is a spring K and a damper B between the robot and ground.
+A display is a robot that moves like a virtual mass M with virtual damping D. The environment, e.g. a hand, is a spring
+K and a damper B between the robot and ground. The study computes the largest stable K over grids of M, D and delay, and
+the stable values of M for given hands.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE
 
 
 def _read_robot(raw: Any) -> Any:
-    """Return the model of a robot: a lag, or a linear system given by a text or a mapping."""
+    """Return the model of the robot, a lag or a linear system, from a mapping or a text."""
     if isinstance(raw, ActuatorSection | SystemSection):
         return raw
     if isinstance(raw, str) and ("/" in raw or raw.startswith("sos:")):
         try:
             raw = parse_system("robot", raw, "s")
         except InputError as error:
-            # Remove the prefix "robot: ", because the location is reported separately.
+            # Remove the prefix "robot: ", because the report already contains the key "robot".
             raise parse_message(str(error).removeprefix("robot: ")) from None
     if not isinstance(raw, dict):
         allowed = "a robot is a lag or a linear system from commanded to actual motion"
@@ -51,7 +52,7 @@ def _read_robot(raw: Any) -> Any:
     return (ActuatorSection if is_lag else SystemSection).model_validate(raw)
 
 
-# The type includes texts only for the schema; the validator converts them to linear systems.
+# List ``str`` only for the JSON Schema, because `_read_robot` converts a text to a linear system.
 _Robot = Annotated[ActuatorSection | SystemSection | str, WrapValidator(lambda raw, _: _read_robot(raw))]
 _Mass = Annotated[Axis, AxisOf(Quantity("kg", POSITIVE))]
 _Damping = Annotated[Axis, AxisOf(Quantity("N s/m", NOT_NEGATIVE))]
@@ -75,19 +76,19 @@ class AdmittanceStudy(ComputedStudy):
     """Virtual damping D, in N s/m or with a unit."""
 
     robot: _Robot
-    """Robot, from commanded to actual motion: a lag such as {time_constant: 20 ms} or {cutoff: 10 Hz, order: 2}, or a
-    linear system ('400 / 1 28 400' in s, or a mapping)."""
+    """Model of the robot from commanded to actual motion: a lag such as {time_constant: 20 ms} or {cutoff: 10 Hz,
+    order: 2}, or a linear system ('400 / 1 28 400' in s, or a mapping)."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(
         default=None, validate_default=True
     )
     delay: Annotated[Axis, axis_of("delay")]
-    """Delay from the measurement of a force until the command computed from it acts on the robot, in s or with a unit;
-    also in sampling periods."""
+    """Delay from the measurement of a force until the command computed from it acts on the robot: in s, with a unit, or
+    in sampling periods."""
 
     command: Literal["position", "velocity"] = "position"
-    """Command that the program sends to the robot."""
+    """Kind of command that the program sends to the robot."""
 
     integrator: Literal["semi-implicit", "trapezoidal"] = "semi-implicit"
     """Method that integrates the motion of the virtual mass."""
@@ -96,8 +97,8 @@ class AdmittanceStudy(ComputedStudy):
     """Damping B of the environment, in N s/m or with a unit. Default: 0."""
 
     hand_stiffness: _Stiffness | None = None
-    """Stiffnesses K of hands or environments, in N/m or with a unit, for which the study computes the stable virtual
-    masses. Default: none."""
+    """Stiffnesses K of hands or environments, in N/m or with a unit. For each, the study also computes the stable
+    virtual masses. Default: none."""
 
     rotary: Rotary = Field(default_factory=read_rotary)
     """True for rotary displays. One quantity with a rotary unit makes all devices of a file rotary."""
@@ -127,7 +128,7 @@ class AdmittanceStudy(ComputedStudy):
     def find_faults(self) -> Iterable[LocatedProblem]:
         yield from super().find_faults()
         try:
-            # Every delay must be an integer if the robot is sampled; other robots accept every delay.
+            # Check all delays of a robot in z, because they must be integers; for other robots, one delay is enough.
             sampled = getattr(self.robot, "sampled", None)
             for delay in self.delay.values()[: None if sampled else 1].tolist():
                 loop = self._make_display(delay).loop
@@ -139,9 +140,9 @@ class AdmittanceStudy(ComputedStudy):
             yield (field,), parse_message(text)
 
     def _make_display(self, delay: float) -> AdmittanceDisplay:
-        """Return the display with the first virtual mass and damping, and a delay in the unit of the study's delays."""
+        """Return the display with the first M and D of the study; ``delay`` is in s or periods, as in the study."""
         units, span = self.unit_system, Span(delay, "periods" if self.delay.in_periods else "s")
-        # Pass the numbers with their units, because the units determine the kind of the display, linear or rotary.
+        # Pass texts with units, because the display derives its kind, linear or rotary, from them.
         mass = f"{float(self.virtual_mass.values()[0])!r} {units['kg']}"
         damping = f"{float(self.virtual_damping.values()[0])!r} {units['N s/m']}"
         timing, robot = Timing(self.period, span), cast(PartSection, self.robot).instance
@@ -170,7 +171,7 @@ class AdmittanceStudy(ComputedStudy):
         )
 
     def _find_masses(self, display: AdmittanceDisplay, d: float) -> list[dict[str, float]]:
-        """Return a row with the stable virtual masses per virtual damping and hand; ``d`` is the delay in periods."""
+        """Return the smallest and largest stable M for each D, B and hand; ``d`` is the delay in periods."""
         rows = []
         stiffness = [] if self.hand_stiffness is None else self.hand_stiffness.values().tolist()
         dampings = self.virtual_damping.values().tolist(), self._dampers.tolist()
@@ -181,7 +182,7 @@ class AdmittanceStudy(ComputedStudy):
         return rows
 
     def _spell_limits(self, table: dict[str, np.ndarray]) -> tuple[str, ...]:
-        """Return lines with the smallest and the largest limit of all displays."""
+        """Return the printed line with the smallest and the largest K limit of all displays in the table."""
         stiffness = table[SI_COLUMNS[0]]
         if not np.isfinite(stiffness).any():
             return ("no display is stable in any environment",)
@@ -190,7 +191,7 @@ class AdmittanceStudy(ComputedStudy):
         return (f"stable up to {' and '.join(texts)}",)
 
     def _spell_row(self, table: dict[str, np.ndarray], k: int) -> str:
-        """Return the limit of one display and its varied parameters as text."""
+        """Return a phrase with the K limit in row ``k`` of the table and the parameters of this display."""
         units = self.unit_system
         K = with_unit(round_conservatively(float(table[SI_COLUMNS[0]][k]), "below"), units["N/m"])
         names = zip(
@@ -209,7 +210,7 @@ class AdmittanceStudy(ComputedStudy):
         return f"K = {K} with {', '.join(words)}"
 
     def _spell_masses(self, rows: list[dict[str, float]]) -> tuple[str, ...]:
-        """Return a line with the stable virtual masses in the first hand; empty without hands."""
+        """Return the printed line with the stable M for the first hand; an empty tuple if the study has no hands."""
         if not rows:
             return ()
         row, units = rows[0], self.unit_system

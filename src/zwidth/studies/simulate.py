@@ -131,7 +131,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
     """Number of recorded points per period."""
 
     tool_position: Annotated[float, quantity_of("start_position")] | None = None
-    """Initial position of the tool in a scene with a tool. Default: that of the device."""
+    """Initial position of the tool, for a scene with a tool. Default: the initial position of the device."""
 
     stiffness_fraction: Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))] | None = None
     """Stiffness as a fraction of the maximum stable stiffness K_max, with the virtual damping at K_max; alternative to

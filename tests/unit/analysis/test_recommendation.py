@@ -178,7 +178,7 @@ def test_improvements_of_stiffness_fraction_are_limits_with_gain():
     [
         ({"gain_margin": 1.0}, "gain_margin: got 1.0; a number greater than 1 is needed"),
         ({"phase_margin": 180}, "phase_margin: got 180; a number greater than 0 and less than 180 is needed"),
-        ({"phase_margin": "30"}, "phase_margin: got '30'"),
+        ({"phase_margin": "30 N"}, "phase_margin: got '30 N'"),
         ({"stiffness_fraction": 1.5}, "stiffness_fraction: got 1.5; a number greater than 0 and less than 1"),
         ({"stiffness_fraction": True}, "stiffness_fraction: got True"),
         ({"passive": "yes"}, "passive: got 'yes'; True or False is needed"),

@@ -36,13 +36,16 @@ def test_stable_contact():
     lines = call(*DISPLAY, *LAG, *LOOP, "--environment", "1 kN/m").splitlines()
     assert lines[0] == "STABLE     in an environment with K = 1.000 kN/m, B = 0 N s/m"
     assert "margins    gain 2.160, phase 12.90 deg at 1.07 Hz, modulus 0.2070" in lines
-    assert lines[-1] == "room       M from 60.01 g; D from 28.41 N s/m to 19.99 kN s/m, each alone"
+    assert (
+        lines[-1] == "room       M from 60.01 g; D from 28.41 N s/m to 19.99 kN s/m, each alone; no margins at the ends"
+    )
 
 
 def test_printed_remedies_stabilize_the_contact():
     output = call(*DISPLAY, *LAG, *LOOP, "--environment", "5 kN/m")
     assert output.startswith("UNSTABLE   in an environment with K = 5.000 kN/m")
-    assert "remedy     M from 60.05 g to 393.6 g; D from 132.4 N s/m to 19.99 kN s/m, each alone" in output
+    assert "remedy     M from 60.05 g to 393.6 g; D from 132.4 N s/m to 19.99 kN s/m, each alone;" in output
+    assert output.split()[-5:] == ["no", "margins", "at", "the", "ends"]
     for M, D in ((0.06005, 60), (0.3936, 60), (20, 132.4), (20, 19.99e3)):
         assert make_display(M, D).is_stable(5e3, 0)
 

@@ -62,6 +62,11 @@ def test_fields_with_units_become_arguments_of_simulate():
 
 def test_omitted_fields_have_the_defaults_of_simulate():
     defaults = {name: parameter.default for name, parameter in inspect.signature(zwidth.simulate).parameters.items()}
+    # simulate computes 1000 periods if it is called without periods and without duration.
+    assert (defaults["periods"], defaults["duration"]) == (None, None)
+    scene = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3, 1e-3))
+    assert len(scene.simulate(1e3, 5).measured) == 1000
+    defaults["periods"] = 1000
     for name, value in SimulationConditions().list_options(1e-3).items():
         assert value == defaults[name], name
     assert {"static", "max_force", "max_rate"}.isdisjoint(SimulationConditions().list_options(1e-3))

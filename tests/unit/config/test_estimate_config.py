@@ -77,10 +77,11 @@ def test_faults_are_located(load, text):
 
 
 def test_kind_of_study_without_parts_refuses_the_estimates(load):
-    with pytest.raises(ConfigFileError, match="got a device with position and feedback; the kind 'ridge' accepts only"):
+    words = "got a device with position and feedback; the kind 'passivity' accepts only"
+    with pytest.raises(ConfigFileError, match=words):
         load(
             f"{SCENE}, position: {{kind: pll, bandwidth: 500}}, feedback: {{kind: integral, gain: 1}}}}\n"
-            "studies: [{kind: ridge, name: r}]\n"
+            "studies: [{kind: passivity, name: r}]\n"
         )
 
 

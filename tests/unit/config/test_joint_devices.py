@@ -9,6 +9,7 @@ import pytest
 
 import zwidth
 from zwidth.config.fields import ConfigFileError
+from zwidth.core.errors import format_install_command
 from zwidth.model import mujoco_model
 from zwidth.studies.document import Config
 
@@ -193,4 +194,4 @@ def test_missing_package_is_named(load, model_file, monkeypatch):
         load(scene_with("model: arm.xml, site: handle, direction: x"))
     (fault,) = error.value.faults
     assert fault.field == "scene.device"
-    assert "zwidth[mujoco]" in str(fault)
+    assert format_install_command("mujoco") in str(fault)

@@ -99,7 +99,7 @@ SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _WITH_SLIDER
 ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _WITH_SLIDER}
 # Parameters of a scene with m = 1 and T = 1, by the normalized parameter whose value they have.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
-_AS_GIVEN = "coefficients, as given"  # text of the choices that only a configuration file can set
+_AS_GIVEN = "coefficients, as given"  # text on the page for parts that only a configuration file can define
 CHOICES = {
     "mode": {"physical": "physical", "normalized": "normalized"},
     "motion": {"linear": "linear", "rotary": "rotary"},
@@ -241,7 +241,7 @@ class Controls:
             raise InputError(f"{name}: coefficients can only be set in a configuration file; choose another kind")
         changes = {name: parts[kind]}
         if has_velocity(changes.get("position")):
-            # Reset the velocity estimate, because the phase-locked loop estimates the velocity, too.
+            # Reset the velocity estimate to its default, because a phase-locked loop also estimates the velocity.
             changes["velocity"] = BackwardDifference()
         return replace(self, scene=scene.replace(**changes))
 
@@ -276,7 +276,7 @@ def _check_range(name: str, slider: Slider, value: float) -> None:
 
 
 def _name_class(part: Any) -> str:
-    """Return the name of the class of an estimate or feedback; "none" for None."""
+    """Return the name of the class of an estimate or of further feedback, such as "LowPass"; "none" for None."""
     return "none" if part is None else type(part).__name__
 
 

@@ -181,7 +181,7 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
     sign = xp.where(rising, 1.0, -1.0)
 
     def rise(x: Array) -> tuple[Array, Array]:
-        """Return k and dk/dw, with the sign with which k increases over the bracket."""
+        """Return k and dk/dw, both multiplied by the sign that makes k increase over the bracket."""
         k, slope = (combine(each, values) for values in split_values(evaluate(loops.form, part, x)))
         return sign * k, sign * slope
 

@@ -139,8 +139,8 @@ def _add_tool(
 ) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly]:
     """Add a simulated tool to the characteristic polynomial ``D + alpha N1 + beta N2`` of a device.
 
-    The responses of the device are P H = N1/D and V H = N2/D, and those of the tool are G_t and V_t G_t, so that the
-    new characteristic polynomial is that of ``1 + alpha (P H + G_t) + beta (V H + V_t G_t)``.
+    The estimates of position and velocity of the device have the responses P H = N1/D and V H = N2/D to the force,
+    those of the tool G_t and V_t G_t. The closed loop is ``1 + alpha (P H + G_t) + beta (V H + V_t G_t) = 0``.
 
     Args:
         D, N1, N2: the polynomials of the device.
@@ -152,8 +152,8 @@ def _add_tool(
 
     gain, power, a2, a1, a0 = response
     zeta = flint.arb_poly([-1, 1])
-    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0. A tool without spring has a0 = 0. If D also
-    # has a zero at z = 1, omit the factor zeta of one of the two denominators.
+    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0; a0 is 0 for a tool without a spring.
+    # If D and the denominator of G_t share a factor zeta, omit it in one of them.
     tool = zeta * a2 + flint.arb_poly([a1]) if common else zeta * zeta * a2 + zeta * a1 + flint.arb_poly([a0])
     rest = (D // zeta if common else D) * flint.arb_poly([0] * power + [1]) * gain
     v_numerator, v_denominator = _expand_estimate(velocity)

@@ -42,17 +42,17 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
 
 
 def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse) -> StateSpace:
-    """Return the state-space model from the position x of the device to its force, with a virtual coupling to a tool.
+    """Return the controller with a virtual coupling to a tool in state space, from the position x to the force.
 
-    The coupling computes ``f = alpha (P x - y) + beta (V x - V_t y)`` from x and the position y = G_t f of the tool.
-    The force is f + R x. If V is no observer and no input of R, one filter computes V x - V_t y from a difference.
+    The coupling computes ``f = alpha (P x - y) + beta (V x - V_t y)``. The tool has the position y = G_t f.
+    The force is f + R x. If V belongs to no observer and is no input of R, one filter computes the relative velocity.
     """
     estimates = chain.estimates or LoopEstimates(velocity=chain.estimate)
     if estimates.uses_velocity:
-        # Filter x and y separately, because R or the observer needs V x.
+        # Filter x and y separately, because V x is needed as an input of R, or an observer computes it.
         program, sources = realize_estimates(estimates), np.array([[alpha, beta, 0.0], [0.0] * 3, [0.0, 0.0, 1.0]])
     else:
-        # Without the velocity filter, the second output is its input: P x, or x for the structure "separate".
+        # Omit the velocity filter: the second output is then its input, P x, or x for the structure "separate".
         program = realize_estimates(replace(estimates, velocity=Estimate(0)))
         sources = np.array([[alpha, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     plant = factor_tool(tool)
@@ -60,9 +60,9 @@ def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse)
         realize_estimate(estimates.of_tool),
         realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles)),
     )
-    # States: those of the program, the velocity filter and the tool. Each signal is a row of factors of the states and
-    # of x, in the last column. The filter has the input ``rest - y``, and the coupling has the force
-    # ``spring - alpha y + beta (filter output)``.
+    # The states are those of the program, the velocity filter and the tool.
+    # Each signal is a row vector: the factors of all states and, in the last column, of x.
+    # The filter has the input rest - y. The coupling has the force spring - alpha y + beta (output of the filter).
     sizes = [len(program.A), len(difference.A), len(response.A)]
     ends = np.cumsum([0, *sizes])
     rows = np.eye(ends[-1] + 1)
@@ -72,7 +72,7 @@ def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse)
     through = float(response.D[0, 0])
     gain = alpha + beta * float(difference.D[0, 0])
     still = response.C @ moved
-    # Solve y = still + through f together with the force f.
+    # The position of the tool, y = still + through f, depends on f. Insert it into the force, and solve for f.
     f = spring - alpha * still + beta * (difference.C @ filtered + difference.D @ (rest - still))
     f = f / (1.0 + gain * through)
     y = still + through * f

@@ -64,27 +64,28 @@ def compose_loop(plant: FactoredPlant, estimates: LoopEstimates) -> LoopRoots:
 
 
 def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: FactoredPlant) -> LoopRoots:
-    """Return the loop of a virtual coupling, with the response of a simulated tool added to the loop of a device.
+    """Return the loop of a virtual coupling between a device and a simulated tool.
 
     Args:
-        device: the loop of the device without a tool, i.e. with ``G = P H`` and ``F = V/P``.
+        device: the loop of the device without the tool: the plant is ``G = P H``, the velocity estimate ``F = V/P``.
         estimates: the estimates P and V of the device; None if P is 1.
         tool: the response G_t of the tool.
     """
     plant, F = add_plants(device, tool), device.estimate
     if estimates is None or estimates.structure == "series":
-        # With V = P F and V_t = F, the velocity estimate of the coupling is F, too.
+        # With V = P F for the device and V_t = F for the tool, the coupling force is (alpha + beta F) (P x - y).
         return LoopRoots(**vars(plant), estimate=F)
     V, gain, lag = estimates.velocity, device.gain * float(F.gain), device.lag + F.lag
     if estimates.structure == "separate":
-        # V_t is V, so that V H + V_t G_t = V (H + G_t). The zeros of F = V/P are those of V, then the poles of P. If V
-        # is an input of R, the poles of V are zeros of H, because they are not poles of G F = V H.
+        # The tool has the velocity estimate V_t = V, so the velocity part of the loop is V H + V_t G_t = V (H + G_t).
+        # The zeros of F = V/P are first those of V, then the poles of P.
+        # If V is an input of R, the poles of V are zeros of H, and cancel in V H.
         released = V.poles[: 0 if device.free_poles.size else None]
         zeros = np.concatenate([device.free_zeros, F.zeros[np.size(V.zeros) :], released])
         outer, second = V, tool
         first = _build_plant(gain / float(V.gain), lag - V.lag, zeros, device.poles)
     else:
-        # V_t is the backward difference (z - 1)/z. Its factor 1/z is split off.
+        # The tool has the velocity estimate (z - 1)/z: ``outer`` contains the factor 1/z, ``second`` the zero at z = 1.
         outer = Estimate(0, lag=1)
         first = _build_plant(gain, lag - 1, np.concatenate([device.free_zeros, F.zeros]), device.poles)
         second = replace(tool, zeros=np.append(tool.zeros, 0.0))
@@ -100,7 +101,7 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
 
 
 def _build_plant(gain: float, lag: int, zeros: np.ndarray, poles: np.ndarray) -> FactoredPlant:
-    """Return a plant with a nonnegative lag; a negative lag -k becomes k zeros at z = 0."""
+    """Return a plant with the given factors, where ``lag`` = -k < 0 becomes k zeros at z = 0."""
     return FactoredPlant(gain, max(lag, 0), np.concatenate([zeros, np.ones(max(-lag, 0))]), poles)
 
 

@@ -151,7 +151,7 @@ def count_outside(
     # Start at a real z slightly above 1, where L is real. From there, the path around n poles at z = 1 changes the
     # phase of L by -n pi/2.
     is_integrator = np.abs(loop.open_poles) <= POLE_AT_ONE
-    # Each zero at exactly z = 1, such as that of a coupling with a free tool, changes the phase by +pi/2.
+    # Each zero at exactly z = 1 changes the phase by +pi/2; a coupling to a free tool has such a zero.
     n = int(np.count_nonzero(is_integrator) - np.count_nonzero(loop.terms[0].zeros == 0))
     sign = _find_sign(loop, is_integrator, alpha, beta)
     start = np.where(sign < 0, np.pi, 0.0)

@@ -40,16 +40,16 @@ DIFFERENCE_STEP = 1e-3
 
 
 class StateTerms:
-    """Response of the states of a device, in sampling periods, to a unit command from rest, in Taylor arithmetic."""
+    """Taylor expansion of the response of a device's states to a unit command from rest, for time in periods."""
 
     def __init__(self, A: Taylor, B: Taylor, one: Taylor, fraction: Taylor, sampled: bool) -> None:
-        """Compute Psi, Gamma(1) and Gamma(1 - f).
+        """Compute Psi, the transition matrix over one period minus 1, and Gamma(t), the states at t = 1 and t = 1 - f.
 
         Args:
-            A, B: matrices of the device; if ``sampled``, those of one period, otherwise those of continuous time.
-            one: the number 1 with the variables of A and B.
+            A, B: matrices of the device, in discrete time if ``sampled`` is True, otherwise in continuous time.
+            one: the number 1 as a Taylor object with the variables of A and B.
             fraction: fractional part f of the delay.
-            sampled: whether the device is in discrete time, for one period and one delay.
+            sampled: True for a device in discrete time, which is valid for one period and one delay.
         """
         if sampled:
             self.psi, self.full, self.late = A + stack(-np.eye(len(A.v)), one), B, B
@@ -58,7 +58,10 @@ class StateTerms:
             self.late = flow(A, B, one - fraction)[1]
 
     def respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
-        """Return ``zeta - Psi`` and ``x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1))``, with ``zeta = z - 1``."""
+        """Return the matrix zeta - Psi, and the states x as transfer functions of the command, without the lag.
+
+        The states are ``x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1))`` at ``zeta = z - 1``; x[0] is the position.
+        """
         matrix = zeta.map(lambda part: np.multiply.outer(np.eye(len(self.full.v)), part)) - self.psi
         return matrix, solve(matrix, self.full + self.late * zeta.map(lambda part: np.asarray(part)[None]))
 
@@ -93,7 +96,7 @@ class LoopTerms:
         self.states = StateTerms(A, B, self.one, delay - n, chain.sampled)
 
     def controller(self, lam: Taylor) -> Jet:
-        """Return q = -1/G and its derivative in lambda = log z; with a simulated tool, G includes its response."""
+        """Return q = -1/G and its derivative in lambda = log z; G is the response of device and simulated tool."""
         q = self._control_device(lam)
         if self.scene.tool is None:
             return q
@@ -173,7 +176,7 @@ class LoopTerms:
             return self._difference_estimate(lam)
 
     def _estimate_coupling(self, ratio: Jet, lam: Taylor) -> Jet:
-        """Return F of a coupling and its derivative in lambda, from the ratio V/P of the estimates of the device.
+        """Return the velocity estimate F of a coupling and dF/dlambda, from the ratio V/P of the device.
 
         F is (V H + V_t G_t)/G with G = P H + G_t, so it is ``q (V/P/q_d - V_t G_t)`` with q_d = -1/(P H).
         """
@@ -252,7 +255,7 @@ def differentiate(
         added_delay: value of the first unknown if it is a delay in periods to be added to that of the scene.
 
     Returns:
-        Each unknown; derivatives that are not available are NaN.
+        The unknowns, in order; derivatives that are not available are NaN.
     """
     n = int(np.floor(scene.d + (added_delay or 0.0)))
     leaves = list_leaves(scene)
@@ -308,7 +311,7 @@ def split(value: Taylor) -> list[Taylor]:
 
 
 def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> list[Taylor]:
-    """Return alpha, beta and omega of the stiffest wall, with their derivatives in all numbers of a scene (V21)."""
+    """Return alpha, beta and omega of the stiffest wall, with derivatives (docs/theory/scenes.md, V21)."""
     is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
     free = [k for k in range(2) if is_pair[k]]
     extra = [ridge.alpha, ridge.beta, *((ridge.w1, ridge.w2)[k] for k in free)]

@@ -138,7 +138,10 @@ class LoopRoots(FactoredPlant):
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def invert_estimate(self) -> LoopRoots:
-        """Return the loop with the plant 1/F and the backward difference. F must have as many poles as zeros."""
+        """Return a loop with the plant 1/F and the backward difference as velocity estimate.
+
+        F must have the same number of poles and zeros, including those at z = 0.
+        """
         f = self.estimate
         lag, at_one = -f.lag - f.window, np.zeros(min(f.window, 1))
         zeros = np.concatenate([f.poles, np.ones(max(-lag, 0))])

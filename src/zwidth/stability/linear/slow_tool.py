@@ -1,22 +1,22 @@
 """Stability of a virtual coupling to a tool that a physics engine integrates only every N sampling periods.
 
-The program computes the coupling force f from the distance e = x - y of device and tool in each period. The engine
-integrates the tool by one step of length N T at the samples 0, N, 2 N, ...; between these steps the position y of the
-tool is constant. In normalized units (T = 1 and the mass m = 1), with the states s of the velocity estimate F and the
-*increment* w of y per step (`model.tool.ToolStep`), one period changes the state Z = (s, device, delayed forces, w, y)
-as follows:
+The coupling has the normalized stiffness alpha and damping beta, and exerts the force f; w is the *increment* of the
+position y of the tool per step. In each period, the program computes f from the distance e = x - y of device and tool.
+The engine integrates the tool by one step of length N T at the samples 0, N, 2 N, ... (`model.tool.ToolStep`); between
+these steps y is constant. F is the velocity estimate with the states s. In normalized units (T = 1 and the mass m = 1),
+one period changes the state Z = (s, device, delayed forces, w, y) as follows:
 
     every period     f = alpha e + beta F e;  velocity estimate and device advance by one period with the force -f
     every N periods  w = decay w - spring y + gain f;  y = y + w
 
-"semi-implicit": f is computed from the old y; all samples after the step have the new y. "implicit": f is computed from
-the new y, in the period of the step also. If device and tool are free, a common displacement of both does not change e.
-Then the positions of the device are measured relative to y, and the state has no y.
+In a period with a step, "semi-implicit" computes f from the old y, "implicit" from the new y. If device and tool are
+free, a common displacement of both does not change e. Then the positions of the device are measured relative to y, and
+the state does not contain y.
 
-With the period maps H of a period without a step and S of a period with a step, the state changes over N periods by the
-*monodromy matrix* ``H^(N-1) S``. The loop is stable if and only if the spectral radius of this matrix is below 1
-(Floquet theory; docs/theory/passivity.md, U9). All matrices are stored minus the identity, because the subtraction of 1
-from an eigenvalue near 1 would lose digits.
+The matrix H maps the state over a period without a step, S over a period with a step. The *monodromy matrix*
+``H^(N-1) S`` maps the state over N periods. The loop is stable if and only if the spectral radius of this matrix is
+below 1 (Floquet theory; docs/theory/passivity.md, U9). All matrices are stored minus the identity, because the
+subtraction of 1 from an eigenvalue near 1 would lose digits.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.poles import log_modulus
 
 BLOCK_SIZE = 1 << 21  # values per block of couplings; a monodromy matrix has states^2 values
-# Largest log|eigenvalue| that counts as 0, i.e. as on the unit circle: a constant, and the rounding error of the matrix
-# divided by the distance of the dominant eigenvalue to the nearest other one.
+# An eigenvalue counts as on the unit circle if |log|eigenvalue|| is below ON_CIRCLE or its rounding error.
+# The rounding error is ROUNDING divided by the distance to the nearest other eigenvalue.
 ON_CIRCLE, ROUNDING = 1e-13, 1e-15
-LARGEST = 1e100  # entries of a monodromy matrix above which its factors are scaled, so that they do not overflow
+LARGEST = 1e100  # entry of a monodromy matrix above which the products H S, H^2 S, ... are scaled against overflow
 
 
 @dataclass(frozen=True, eq=False)
 class SlowToolModel:
-    """State-space model of the loop; alpha and beta, the normalized K and B of the coupling, are not yet fixed.
+    """State-space model of the loop for all values of alpha and beta, the normalized K and B of the coupling.
 
-    The *rows* are linear functions of the state Z.
+    A *row* r defines a signal ``r Z``, a linear function of the state Z.
     """
 
     every: int  # N, periods per step of the engine
-    drift: Array  # period map minus identity at alpha = beta = 0
+    drift: Array  # map of the state over one period without a coupling force, minus the identity
     force: Array  # change of the state per unit of the force f, which acts on the device with the opposite sign
-    distance: Array  # row of e
+    distance: Array  # row of the distance e from the tool to the device
     velocity: Array  # row of the velocity estimate F e
-    increment: Array  # row of w
-    step: Array  # row of the change of w in one step without force
+    increment: Array  # row of w, the increment of y per step
+    step: Array  # row of the change of w in a step of the tool without a coupling force
     moved: Array  # change of the state if y increases by 1 while the device stays where it is
-    gain: float  # gain of the step of the tool
+    gain: float  # change of w per unit of the force f in a step of the tool
     feedthrough: float | None  # direct feedthrough of the velocity estimate; None for "semi-implicit"
 
     @classmethod
     def build(cls, chain: AnyChain, tool: ToolStep) -> SlowToolModel:
-        """Return the model of a device with hand, delay and velocity estimate (``chain``), and of a tool."""
+        """Build the model from a device with hand, delay and velocity estimate (``chain``), and a tool."""
         F, plant, states = realize_estimate(chain.estimate), sample_states(chain), sample_states(chain).realize()
         n_filter, n_body, n_device = len(F.A), plant.psi.shape[-1], len(states.A)
         rigid = find_rigid_displacement(chain, plant.psi) if tool.spring == 0 else None
@@ -86,16 +86,16 @@ class SlowToolModel:
         return cls(tool.every, drift, force, distance, velocity, w, step, moved, float(tool.gain), feedthrough)
 
     def compute_multipliers(self, alpha: Array, beta: Array) -> tuple[Array, Array]:
-        """Return the eigenvalues of the monodromy matrices of couplings, and the largest ``log|eigenvalue|`` of each.
+        """Return the eigenvalues of the monodromy matrix, and the largest ``log|eigenvalue|``, for each coupling.
 
         Args:
             alpha: normalized stiffness of the couplings, shape (couplings,).
             beta: normalized damping, of the same shape.
 
         Returns:
-            Eigenvalues minus 1, shape (couplings, states), and logarithms, shape (couplings,). A logarithm that does
-            not exceed the rounding errors of the eigenvalues is 0. For a coupling whose monodromy matrix overflows or
-            is not finite, the eigenvalues are NaN; the logarithm is also valid after an overflow.
+            Eigenvalues minus 1, shape (couplings, states), and logarithms, shape (couplings,). A logarithm is set to 0
+            if it does not exceed the rounding error of its eigenvalue. If a monodromy matrix overflows, its eigenvalues
+            are NaN, but its logarithm is valid. If H or S is not finite, both are NaN.
         """
         size = len(self.drift)
         multipliers, logs = np.full((alpha.size, size), complex(np.nan)), np.full(alpha.size, np.nan)
@@ -121,12 +121,12 @@ class SlowToolModel:
         return multipliers, logs
 
     def _build_maps(self, alpha: Array, beta: Array) -> tuple[Array, Array]:
-        """Return the maps H of a period without and S of a period with a step, minus the identity, per coupling."""
+        """Return the matrices H and S (period without and with a step of the tool) minus the identity, per coupling."""
         f = alpha[:, None] * self.distance + beta[:, None] * self.velocity
         hold = self.drift - self.force[:, None] * f[:, None, :]
         change = self.step + self.gain * f
         if self.feedthrough is not None:
-            # f is computed from the new y, which reduces e by the new w. Solve both equations for w.
+            # "implicit": the new w reduces the distance e from which f is computed, and f changes w. Solve for w.
             stiffness = self.gain * (alpha + beta * self.feedthrough)[:, None]
             change = (change - stiffness * self.increment) / (1.0 + stiffness)
         step = self.increment[:, None] * change[:, None, :]
@@ -135,7 +135,7 @@ class SlowToolModel:
 
 
 def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
-    """Return the states of a device that is displaced by 1 as a rigid body; None unless the device is free.
+    """Return the states of a device at rest at the position 1, without forces; None unless the device is free.
 
     Args:
         chain: model of the device.
@@ -143,13 +143,13 @@ def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
     """
     if not np.any(find_roots(chain).poles == 0):
         return None
-    # A displacement is constant without force, so it is in the null space of psi. Its first entry is the position.
+    # These states are constant without forces, so they are in the null space of psi. The first state is the position.
     rest = np.linalg.lstsq(psi[:, 1:], -psi[:, 0], rcond=None)[0]
     return np.concatenate([[1.0], rest])
 
 
 def _compute_logs(multipliers: Array) -> Array:
-    """Return the largest ``log|eigenvalue|`` from the eigenvalues minus 1, or 0 if it is below the rounding error."""
+    """Return the largest ``log|eigenvalue|`` for eigenvalues minus 1; 0 if it is below its rounding error."""
     each = log_modulus(multipliers)
     logs = each.max(-1)
     near = np.flatnonzero(np.abs(logs) < np.sqrt(ROUNDING))
@@ -160,12 +160,12 @@ def _compute_logs(multipliers: Array) -> Array:
 
 
 def _compose(second: Array, first: Array) -> Array:
-    """Return the product of two matrices (second times first), all minus the identity."""
+    """Return the product ``second first``; arguments and result are matrices minus the identity."""
     return second + first + second @ first
 
 
 def _raise(matrix: Array, power: int) -> Array:
-    """Return a power >= 1 of a matrix by repeated squaring, both minus the identity."""
+    """Return a power >= 1 of a matrix by repeated squaring; argument and result are minus the identity."""
     result = None
     while True:
         if power & 1:
@@ -178,7 +178,7 @@ def _raise(matrix: Array, power: int) -> Array:
 
 
 def _compute_scaled_log(hold: Array, tick: Array, every: int) -> float:
-    """Return the largest ``log|eigenvalue|`` of one monodromy matrix, scaled after each product against overflow."""
+    """Return the largest ``log|eigenvalue|`` of a monodromy matrix, whose factors are scaled against overflow."""
     identity, scale = np.eye(len(hold)), 0.0
     product = tick + identity
     for _ in range(every - 1):
