@@ -412,8 +412,7 @@ class SceneOptima(SceneAnalysis):
 
         Numerics:
             Samples in the stable intervals of B, then golden-section search around the three lowest minima, because the
-            optimum is usually a kink at which poles meet. The spectral radius is accurate to about 1e-7 if two poles
-            meet. Run time 0.1 to 1 s.
+            optimum is usually a kink at which poles meet; the radius then has an error of 1e-7. Run time 0.1 to 1 s.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section VIII. Landau 1990 (modulus margin).

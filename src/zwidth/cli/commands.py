@@ -194,11 +194,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the separate stable regions as dicts.
-
-    The result is None for a tool that is integrated only every N > 1 periods, and for a tool with which couplings of
-    arbitrarily large K are stable.
-    """
+    """Return the separate stable regions as dicts; None if they are not available with the tool of the scene."""
     return [island._asdict() for island in scene.islands()] if scene.loop.has_pieces else None
 
 
