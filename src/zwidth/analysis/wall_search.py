@@ -126,7 +126,7 @@ class Requirements(NamedTuple):
 
 
 def _read_limit(name: str, value: Any) -> Any:
-    """Convert a requirement given as text, such as "50%", "6 dB" or "30 deg", to a number; return others unchanged."""
+    """Convert a requirement given as a string, such as "50%" or "6 dB", to a number; return a number unchanged."""
     if not isinstance(value, str):
         return value
     try:
@@ -357,7 +357,7 @@ def _choose_free(
 
 
 class ControllerChoice(NamedTuple):
-    """The chosen wall of a scene, this scene, and its stiffest stable wall."""
+    """A chosen wall, the scene to which it belongs, and the stiffest stable wall of this scene."""
 
     scene: SceneOptima  # the given scene; for a cascade, a copy whose integrator contains pos_gain = K/B
     top: StiffestWall  # the stiffest stable wall of this scene
@@ -367,7 +367,7 @@ class ControllerChoice(NamedTuple):
 def choose_controller(
     scene: SceneOptima, requirements: Requirements, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> ControllerChoice:
-    """Choose the stiffest wall of a scene by `choose_wall`; for a cascade, with its integrator.
+    """Choose the stiffest wall that satisfies requirements; for a cascade, match the integrator to this wall.
 
     The integrator of a cascade integrates the velocity plus ``pos_gain`` times the position. Because ``pos_gain`` is
     K/B, each new wall changes the integrator. The search chooses a wall, matches the integrator to this wall and

@@ -45,7 +45,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 class Joints(NamedTuple):
-    """Matrices of the joints and the vector J' n of the torques per unit force along n, all in SI units as tuples."""
+    """Matrices of the joints, and the vector J' n: joint torques per unit force along n. All are tuples in SI units."""
 
     mass_matrix: tuple[tuple[float, ...], ...]
     damping: tuple[tuple[float, ...], ...]
@@ -55,7 +55,7 @@ class Joints(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class JointDevice(LinearDevice):
-    """Linear system of an arm with several joints along one direction, whose parameters are the joint dampings.
+    """Linear system of an arm with several joints along one direction; its parameters are the dampings of the joints.
 
     `from_mass_matrix` creates it. The damping of joint k, counted from 0, is the entry (k, k) of the damping matrix D.
     Its dotted path in a scene is "joints.k.damping", such as "joints.0.damping".
@@ -65,7 +65,7 @@ class JointDevice(LinearDevice):
     joints: Joints | None = None
 
     def __post_init__(self, sampled: Any) -> None:
-        # Always compute the system from the matrices of the joints, so that both agree.
+        # Always compute the linear system from the matrices of the joints, so that it agrees with them.
         M, D, S, vector = map(np.array, self._get_joints())
         reduced = _reduce(*_normalize(np.linalg.cholesky(M), vector, D, S))
         object.__setattr__(self, "system", _realize(*reduced))
@@ -80,7 +80,7 @@ class JointDevice(LinearDevice):
         """Return the mapping that describes the device in a configuration, under the key ``device``."""
         joints = self._get_joints()
         matrices = {name: [list(row) for row in getattr(joints, name)] for name in joints._fields[:3]}
-        # Write the vector J' n as a Jacobian with one row, which needs no direction.
+        # Write n' J as a Jacobian with one row. It contains the direction n, so the mapping needs no direction.
         return {**matrices, "jacobian": [list(joints.vector)]}
 
     def _get_joints(self) -> Joints:
@@ -133,7 +133,7 @@ def from_mass_matrix(
     Args:
         mass_matrix: symmetric, positive definite matrix M of the joints, shape (joints, joints), in kg m^2 for hinges
             and in kg for slides, including the inertia of the motors. All values of the three matrices are numbers in
-            these units, or texts with units such as "20 mN m s/rad".
+            these units, or strings with units such as "20 mN m s/rad".
         damping: viscous damping of the joints in N m s/rad (hinges) or N s/m (slides): one number, one per joint, or a
             symmetric matrix without negative eigenvalues.
         direction: direction n of the wall, of any length > 0: "x", "y" or "z", or a vector with one component per row
@@ -222,7 +222,7 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
 
 
 def _convert_units(name: str, value: Any) -> Any:
-    """Return a matrix, a vector or a number with all texts, such as "20 mN m s/rad", converted to SI units.
+    """Return a matrix, a vector or a number with all strings, such as "20 mN m s/rad", converted to SI units.
 
     ``name`` is the name of the field, which determines the dimension: a mass, a damping or a stiffness, in the units of
     rotation for hinges and of translation for slides.

@@ -50,7 +50,7 @@ def from_mujoco(
             name of a body, whose origin is the point.
         direction: "x", "y", "z" or a vector of three components in world coordinates.
         pose: pose of the model in one of four forms: a list of joint positions (``qpos``), as numbers in rad or m or as
-            texts such as "30 deg"; a dict of joint positions keyed by joint name, with all other joints in their
+            strings such as "30 deg"; a dict of joint positions keyed by joint name, with all other joints in their
             reference positions; the name of a keyframe of the model; None for the reference pose ``qpos0``.
         rotary: True for a wall that acts on the rotation about ``direction``, such as a knob or a steering wheel.
 
@@ -213,13 +213,13 @@ def _read_pose(model: Any, pose: Any) -> np.ndarray:
 
 
 def _read_position(model: Any, index: int, value: Any) -> float:
-    """Convert one entry of ``qpos``, a number or a text with a unit, to rad (hinges) or m (slides).
+    """Convert one entry of ``qpos``, a number or a string with a unit, to rad (hinges) or m (slides).
 
     ``index`` is the index of the entry in ``qpos``.
     """
     (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
     name = model.joint(int(joint)).name
-    # Accept a number as text, because NumPy converts all entries of an array to texts if one of them is a text.
+    # Accept a number given as a string: NumPy converts all entries of an array to strings if one of them is a string.
     value = float(value) if isinstance(value, str) and looks_like_number(value) else value
     unit = "m" if list_joints(model).get(name) == "slide" else "rad"
     return check_number(f"pose.{name}", value, unit, ANY)

@@ -32,7 +32,7 @@ class ToolResponse(NamedTuple):
 
 
 class ToolStep(NamedTuple):
-    """One step of a tool at the position y, which changes by w: ``w = decay w - spring y + gain f; y = y + w``."""
+    """One step of a tool, which adds the increment w to its position y: ``w = decay w - spring y + gain f; y = y + w``."""
 
     decay: Any
     spring: Any
@@ -103,7 +103,7 @@ class Tool(Part):
     every: int = 1
 
     def respond(self, mass: Any, period: Any) -> ToolResponse:
-        """Return the response G_t = y/f of the tool, divided by T^2/m.
+        """Return the response G_t = y/f of the tool divided by T^2/m, its unit in m/N.
 
         Args:
             mass: m in kg, the unit of mass of the scene.

@@ -245,7 +245,7 @@ def read_arguments(
 
 
 def refuse_unsupported(scenes: list[Any], contact: str, law: TracedLaw | None) -> None:
-    """Raise `InputError` if a scene has a tool that cannot be simulated with the contact or the force law."""
+    """Raise `InputError` if a scene has a tool that the contact, the force law or the velocity estimate excludes."""
     for scene in scenes:
         if scene.tool is None:
             continue

@@ -101,7 +101,7 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
 
 
 def _build_plant(gain: float, lag: int, zeros: np.ndarray, poles: np.ndarray) -> FactoredPlant:
-    """Return a plant with the given factors, where ``lag`` = -k < 0 becomes k zeros at z = 0."""
+    """Return the plant with the given zeros, poles and gain, times z^-lag; ``lag`` = -k < 0 adds k zeros at z = 0."""
     return FactoredPlant(gain, max(lag, 0), np.concatenate([zeros, np.ones(max(-lag, 0))]), poles)
 
 

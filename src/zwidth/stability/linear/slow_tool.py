@@ -121,7 +121,7 @@ class SlowToolModel:
         return multipliers, logs
 
     def _build_maps(self, alpha: Array, beta: Array) -> tuple[Array, Array]:
-        """Return the matrices H and S (period without and with a step of the tool) minus the identity, per coupling."""
+        """Return the maps H and S of the state over a period without and with a tool step, all minus the identity."""
         f = alpha[:, None] * self.distance + beta[:, None] * self.velocity
         hold = self.drift - self.force[:, None] * f[:, None, :]
         change = self.step + self.gain * f
@@ -135,7 +135,7 @@ class SlowToolModel:
 
 
 def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
-    """Return the states of a device at rest at the position 1, without forces; None unless the device is free.
+    """Return the states of a device at rest at the position 1; None if a spring connects the device to ground.
 
     Args:
         chain: model of the device.
@@ -143,13 +143,13 @@ def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
     """
     if not np.any(find_roots(chain).poles == 0):
         return None
-    # These states are constant without forces, so they are in the null space of psi. The first state is the position.
+    # A free device stays at rest, so psi times these states is 0. The first state is the position, which is 1.
     rest = np.linalg.lstsq(psi[:, 1:], -psi[:, 0], rcond=None)[0]
     return np.concatenate([[1.0], rest])
 
 
 def _compute_logs(multipliers: Array) -> Array:
-    """Return the largest ``log|eigenvalue|`` for eigenvalues minus 1; 0 if it is below its rounding error."""
+    """Return the largest ``log|eigenvalue|`` from eigenvalues minus 1; 0 if it is below the rounding error."""
     each = log_modulus(multipliers)
     logs = each.max(-1)
     near = np.flatnonzero(np.abs(logs) < np.sqrt(ROUNDING))
@@ -160,12 +160,12 @@ def _compute_logs(multipliers: Array) -> Array:
 
 
 def _compose(second: Array, first: Array) -> Array:
-    """Return the product ``second first``; arguments and result are matrices minus the identity."""
+    """Return the product of two matrices, ``second first``; all three are stored minus the identity."""
     return second + first + second @ first
 
 
 def _raise(matrix: Array, power: int) -> Array:
-    """Return a power >= 1 of a matrix by repeated squaring; argument and result are minus the identity."""
+    """Return a power >= 1 of a matrix by repeated squaring; both are stored minus the identity."""
     result = None
     while True:
         if power & 1:
