@@ -295,7 +295,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
     Returns:
         List of `Limit`, one per improvement, the largest gain first. Changes that reduce K_max are included, with a
         gain below 1 and the note "harmful", because a filter or a delay may also increase K_max. A filter given by its
-        coefficients is not changed and excludes other rates. NaN if K_max cannot be computed; these entries are last.
+        coefficients is not changed and excludes other rates. Entries without a computed K_max contain NaN and are last.
         The list is empty if K_max is infinite, which is possible for a virtual coupling.
 
     References:

@@ -62,7 +62,8 @@ class CouplingLoop(LinearLoop):
     def stable_ratios(self) -> np.ndarray:
         """Intervals of the ratio alpha/beta, shape (n, 2), in which all sufficiently stiff couplings are stable.
 
-        The array is empty if no coupling is stable in the limit of large beta, or if `has_free_stiffness` is True.
+        The array is empty if no coupling is stable in the limit of large beta. The array is also empty if
+        `has_free_stiffness` is True; then every ratio is stable.
         """
         loop = self.roots
         if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:

@@ -74,7 +74,7 @@ class _World(NamedTuple):
 def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = None) -> UnsafeWorld:
     """Return a passive tool and a passive hand with which a virtual coupling is unstable.
 
-    They exist if the coupling violates the condition of `is_safe_for_every_world`. The tool is a mass M with a spring k
+    Both exist if the coupling violates the condition of `is_safe_for_every_world`. The tool is a mass M with a spring k
     to ground. Its program integrates by the trapezoidal rule, so the tool is lossless: from the force f of the
     coupling, the velocity v, the force s of the spring and the position y, it computes the new values
     ``v' = v + T/(2M) (f' - s' + f - s)``, ``s' = s + k T/2 (v' + v)`` and ``y' = y + T v'``. The hand is a mass and a

@@ -32,7 +32,7 @@ class ToolResponse(NamedTuple):
 
 
 class ToolStep(NamedTuple):
-    """One step of a tool, which adds the increment w to its position y: ``w = decay w - spring y + gain f; y = y + w``."""
+    """One step of a tool, which adds w to its position y: ``w = decay w - spring y + gain f; y = y + w``."""
 
     decay: Any
     spring: Any

@@ -44,16 +44,16 @@ LARGEST = 1e100  # entry of a monodromy matrix above which the products H S, H^2
 class SlowToolModel:
     """State-space model of the loop for all values of alpha and beta, the normalized K and B of the coupling.
 
-    A *row* r defines a signal ``r Z``, a linear function of the state Z.
+    A row vector r yields a signal ``r Z``, a linear function of the state Z.
     """
 
     every: int  # N, periods per step of the engine
-    drift: Array  # map of the state over one period without a coupling force, minus the identity
+    drift: Array  # transition matrix of the state over one period without a coupling force, minus the identity
     force: Array  # change of the state per unit of the force f, which acts on the device with the opposite sign
-    distance: Array  # row of the distance e from the tool to the device
-    velocity: Array  # row of the velocity estimate F e
-    increment: Array  # row of w, the increment of y per step
-    step: Array  # row of the change of w in a step of the tool without a coupling force
+    distance: Array  # row vector that yields the distance e from the tool to the device
+    velocity: Array  # row vector that yields the velocity estimate F e
+    increment: Array  # row vector that yields w, the increment of y per step
+    step: Array  # row vector that yields the change of w in a step of the tool without a coupling force
     moved: Array  # change of the state if y increases by 1 while the device stays where it is
     gain: float  # change of w per unit of the force f in a step of the tool
     feedthrough: float | None  # direct feedthrough of the velocity estimate; None for "semi-implicit"
