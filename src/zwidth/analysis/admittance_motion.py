@@ -37,7 +37,7 @@ class AdmittanceMotion(NamedTuple):
     position: np.ndarray  # position of the robot in m; 0 where the spring of the environment exerts no force
     velocity: np.ndarray  # velocity of the robot in m/s just before the sample; NaN for a discrete-time model
     force: np.ndarray  # measured contact force f_k in N
-    virtual_velocity: np.ndarray  # velocity of the virtual mass in m/s, computed from the force of the same sample
+    virtual_velocity: np.ndarray  # velocity of the virtual mass in m/s, after the force f_k has changed it
     command: np.ndarray  # command that the program sends: position in m, or velocity in m/s
 
 

@@ -93,7 +93,7 @@ class LimitTerms:
     """Taylor expansions of the discretized robot in all variables: the numbers of the display, M, D, B, K and w."""
 
     def __init__(self, display: Any, order: int, n: int) -> None:
-        """Discretize the robot; ``order`` is 1 or 2, and ``n`` the integer part of the delay in periods."""
+        """Discretize the robot. The highest derivative has the ``order`` 1 or 2; the integer delay is ``n`` periods."""
         self.loop, self.n = display.loop, n
         leaves = list_leaves(display)
         # Set the last five variables (M, D, B, K, w) to 1, because the robot does not depend on their values.
@@ -109,12 +109,15 @@ class LimitTerms:
         self.states = StateTerms(self.A, self.b, self.one, fraction, bool(self.loop.plant.dt))
 
     def differentiate(self, factors: list[float], K: float, w: float) -> list[Taylor]:
-        """Return the largest stable K and its frequency in Hz, with derivatives in all numbers of the display, M, D, B.
+        """Return the largest stable K and its frequency in Hz, with derivatives.
 
         Args:
             factors: values of M, D and B.
             K: the limit in N/m.
             w: angle of the pole on the unit circle.
+
+        Returns:
+            K and the frequency; the variables of their derivatives are the numbers of the display, M, D and B.
         """
         values = [*factors, K, w]
         M, D, B, stiffness, angle = (
@@ -150,7 +153,7 @@ class LimitTerms:
         return inverse + (K * position + B * velocity) * (lam * -(self.n + 1)).exp()
 
     def _respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
-        """Return the responses without delay: ``X_1`` of the position and ``(A_1 X + b_1)/T`` of the velocity."""
+        """Return P and V without the factor z^-(n+1): the responses ``X_1`` and ``(A_1 X + b_1)/T`` to the command."""
         state = self.states.respond(zeta)[1]
         velocity = self.b[0]
         for k in range(len(self.b.v)):

@@ -115,7 +115,7 @@ def _confirm_angles(coefficients: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def _expand_crossings(p: Polynomial, p_K: Polynomial) -> np.ndarray:
-    """Return the coefficients of the Chebyshev polynomials U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``."""
+    """Return the coefficients of the Chebyshev polynomials U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``, z = e^(jw)."""
     ascending, other = p[::-1], p_K[::-1]
     size = max(len(ascending), len(other), 1)
     sums = [Fraction(0)] * size
@@ -159,7 +159,7 @@ def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _evaluate(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> Any:
-    """Return the complex stiffness ``K = M u_M + D u_D + B u_B`` with which a pole is at e^(jw), for angles w.
+    """Return the stiffness K of the environment, in general complex, with which a pole is at e^(jw), for angles w.
 
     ``factors`` has a row (M, D, B) per row of ``angles``.
     """

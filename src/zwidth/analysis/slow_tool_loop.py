@@ -40,8 +40,8 @@ PER_DECADE_ON_LINE = 24  # points per decade on a line of constant alpha or beta
 INSERTED = 12  # points inserted at each extremum of the spectral radius near 1, which may hide two crossings of 1
 INSERTIONS = 2  # largest number of passes that insert such points
 PER_DECADE = 8  # points per decade of the first grid in the plane of alpha and beta
-FINE_DECADES, FINE_PER_DECADE = 2, 32  # decades below the largest stable alpha with a fine grid; points per decade
-POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # values of beta on the fine grid: number per N, and its limits
+FINE_DECADES, FINE_PER_DECADE = 2, 32  # decades of the fine grid, below the largest stable alpha; points per decade
+POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # 12 N values of beta on the fine grid, from 96 to 256
 SUMMITS = 3  # number of local maxima of the fine grid, the highest ones, that are refined
 
 # Refinement of a local maximum of alpha in a window of alpha and beta

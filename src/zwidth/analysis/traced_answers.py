@@ -304,7 +304,7 @@ def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *o
 def _differentiate_required(
     scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
 ) -> Taylor:
-    """Return the parameter value for a required stiffness, with derivatives in all numbers and in this stiffness."""
+    """Return the parameter value for a required stiffness, with derivatives in the scene and the stiffness."""
     path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
     changed = scene.replace(**{path: x})
     count, index = len(list_leaves(scene)), index_parameters(changed)[path]

@@ -157,7 +157,7 @@ def _search(alpha: float, beta: float, delta: float, n_delay: int) -> tuple[_Wor
 
 
 def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[_World]:
-    """Return worlds to test: for each frequency chosen, one tool, combined with hands of several masses."""
+    """Return worlds to test: for each selected frequency, one tool, combined with hands of several masses."""
     w = np.union1d(np.geomspace(LOWEST, np.pi, NODES // 2), np.linspace(LOWEST, np.pi, NODES // 2))[:-1]
     one_minus_inverse = 1.0 - np.exp(-1j * w)
     coupling = beta + alpha / one_minus_inverse

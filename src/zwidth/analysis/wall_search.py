@@ -49,7 +49,7 @@ WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
 # Search for the wall of a cascade, whose integrator contains pos_gain = K/B and therefore depends on the wall
 MATCHED = 1e-5  # relative change of K/B below which the search has converged
-RESTARTS = (0.5, 0.1, 0.02)  # pos_gain at the start of further searches, relative to K/B without the integrator
+RESTARTS = (0.5, 0.1, 0.02)  # pos_gain at the start of further searches, relative to K/B of the wall without integrator
 MAX_MATCHES = 8  # largest number of walls chosen per search; 3 usually suffice
 # Factors on K and B, tried in this order, until the wall with its integrator satisfies the requirements
 REDUCTIONS = (1.0, 1.0 - 1e-5, 1.0 - 1e-4, 0.999, 0.99, 0.97, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)

@@ -60,7 +60,7 @@ class StateTerms:
             self.late = flow(A, B, one - fraction)[1]
 
     def respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
-        """Return the matrix zeta - Psi, and the states x as transfer functions of the command without its delay.
+        """Return the matrix zeta - Psi, and the responses x of the states to the command, without the factor z^-(n+1).
 
         The states are ``x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1))`` at ``zeta = z - 1``; x[0] is the position.
         """

@@ -135,7 +135,7 @@ class SlowToolModel:
 
 
 def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
-    """Return the states of a device at rest at the position 1; None if a spring connects the device to ground.
+    """Return the states of a device at rest at the position 1; None if the device has no pole at z = 1.
 
     Args:
         chain: model of the device.
