@@ -70,11 +70,11 @@ class Tool(Part):
         With ``every`` = N > 1, the loop has the period N T (docs/theory/passivity.md, U9). The methods of a scene that
         return stability, spectral radius, poles, stable intervals or the maximum stiffness compute the eigenvalues of
         its monodromy matrix, which maps the state of the loop over N periods. Methods that need the stability boundary
-        raise `InputError`. `Scene.poles` returns these eigenvalues. Spectral radius and decay rate refer to one period. The frequency
-        of the dominant pole is between 0 and ``1/(2 N T)``, because an eigenvalue does not determine multiples of
-        ``1/(N T)``. `Scene.max_stiffness` searches couplings with B >= 0 on a grid with at least 96 values of B and 32
-        values of K per decade, and refines the highest values. It does not find regions that are narrower than the
-        grid. It takes about 0.5 s.
+        raise `InputError`. `Scene.poles` returns these eigenvalues. Spectral radius and decay rate refer to one period.
+        The frequency of the dominant pole is between 0 and ``1/(2 N T)``, because an eigenvalue does not determine
+        multiples of ``1/(N T)``. `Scene.max_stiffness` searches couplings with B >= 0 on a grid with at least 96 values
+        of B and 32 values of K per decade, and refines the highest values. It does not find regions that are narrower
+        than the grid. It takes about 0.5 s.
 
     References:
         Colgate, Stanley, Brown 1995, Proc. IROS, vol. 3 (virtual coupling); Adams, Hannaford 1999, IEEE Trans. Robotics
