@@ -135,9 +135,13 @@ def implies_rotary(scene: Any) -> bool:
     the position unit of the controller is then an error.
     """
     controller = scene.get("controller") if isinstance(scene, Mapping) else None
-    if not isinstance(controller, Mapping) or scene.get("rotary") is False or not looks_like_number(str(scene.get("mass"))):
+    if (
+        not isinstance(controller, Mapping)
+        or scene.get("rotary") is False
+        or not looks_like_number(str(scene.get("mass")))
+    ):
         return False
-    units = find_given_units(controller.get("kind"), controller.get("units"))
+    units = find_given_units(controller.get("kind", "pid"), controller.get("units"))
     return units in ("turns", "degrees", "rad") and all(detect_kind(value) is not False for value in scene.values())
 
 

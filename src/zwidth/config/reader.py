@@ -111,7 +111,9 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
             # Use only the key ``rotary`` of an arm. The units of its joints, such as degrees and N m s/rad, imply
             # nothing, because the wall may act on a linear motion of the arm.
             return data.get("rotary") is True
-        return implies_rotary(data.get("scene")) or data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
+        return implies_rotary(data.get("scene")) or (
+            data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
+        )
     if isinstance(data, list):
         return any(has_rotary_devices(each, key) for each in data)
     if key == "device" and isinstance(data, str):
@@ -169,6 +171,14 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
             first += anchor.end() if anchor else 0
             values[first] = (value, first, first + len(text[first:last].rstrip()))
     return list(values.values())
+
+
+def read_section(path: Path, *keys: str) -> Any:
+    """Return the plain value of nested keys in a valid YAML file, without validation; None if a key is absent."""
+    value = _Tree(str(path), _read_text(str(path))).data
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
 
 
 def _fail(file: str, position: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
