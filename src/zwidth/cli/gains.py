@@ -40,6 +40,7 @@ from zwidth.model.controller_gains import (
     make_controller,
 )
 from zwidth.model.feedback import RULES, IntegralFeedback, IntegrationRule
+from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.wall import VirtualWall
 from zwidth.units.formatting import format_interval, format_wall
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
@@ -196,10 +197,16 @@ def _find_limits(
 ) -> dict[str, tuple[float, float] | None]:
     """Return the stable interval of each gain that is not 0 if only that gain is changed; None if no value is stable.
 
+    Return an empty dict if the intervals are not available.
+
     ``scene`` is the device with the controller; the other arguments are those of `make_controller`, by kind.
     """
     from zwidth.analysis.gain_limits import find_gain_limits
 
+    # A tool with ``every`` > 1 has no open loop. An unstable loop with a measured response may be only undecided.
+    measured = isinstance(scene.device, MeasuredDevice)
+    if not scene.loop.has_boundary or (measured and not bool(scene.is_stable())):
+        return {}
     limits = dict[str, tuple[float, float] | None]()
     for kind, given in gains.items():
         for name in (name for name, gain in given.items() if gain):
