@@ -88,7 +88,7 @@ def _add_options(command: Command) -> Command:
         "--resistance": "Winding resistance in ohm, if the output is a voltage.",
         "--output-unit": "Torque in N m (linear: force in N) per unit of output.  [default: 1]",
     }
-    units = "Position unit of the gains.  [default: turns for a cascade, rad for a PID; m for a linear device]"
+    units = "Position unit of the gains.  [default: turns for a cascade; rad for a PID, m with a linear device]"
     rule = "Rule of integration: forward for ODrive, trapezoidal for SimpleFOC.  [default: backward]"
     options = [
         *(click.option(f"--{name.replace('_', '-')}", type=_GAIN, help=text) for name, text in _HELP.items()),
@@ -275,8 +275,9 @@ def gains(scene: _GivenController, verbose: bool, as_json: bool, **_: Any) -> No
     Gains are numbers in the units of the controller: a cascade (ODrive, VESC, SimpleFOC) has --pos-gain, --vel-gain and
     --vel-integrator-gain; a PID controller (moteus, SmartKnob, Arduino) has --kp, --ki and --kd. With --mass (or
     --device) and --rate (or --period), or with SCENE.yaml, the command prints the results of `zwidth check` for the
-    controller, and for each gain the interval in which the loop is stable. Without gains, the command converts
-    --stiffness and --virtual-damping, or the wall of SCENE.yaml, to gains.
+    controller, and for each gain an interval in which the loop is stable. Without gains, the command converts
+    --stiffness and --virtual-damping, or the wall of SCENE.yaml, to gains. Options replace single gains of the section
+    `controller` of SCENE.yaml. With gains in turns, degrees or rad, a mass without unit is an inertia in kg m^2.
     """
     controller, wall = scene, scene.wall
     result: dict[str, Any] = {

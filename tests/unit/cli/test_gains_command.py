@@ -183,6 +183,19 @@ def test_an_unstable_controller_has_limits_and_a_remedy(gains):
             assert bool(scene.is_stable()) is (value < ends[1])
 
 
+def test_check_reports_an_integrator_with_another_pos_gain_than_the_wall(tmp_path):
+    file = tmp_path / "motor.yaml"
+    controller = "{kind: cascade, pos_gain: 20, vel_gain: 0.16, vel_integrator_gain: 0.32, rule: forward}"
+    file.write_text(FILE.replace("CONTROLLER", controller), encoding="utf-8")
+    wall = ["--stiffness", "2 N m/rad", "--virtual-damping", "50 mN m s/rad"]
+    text = " ".join(run("check", str(file), *wall).split())
+    assert "CAUTION the integrator contains pos_gain = 20.00 1/s, but this wall needs K/B = 40.00 1/s" in text
+    assert "use zwidth gains with the same options" in text
+    assert "integrator contains" in json.loads(run("check", str(file), *wall, "--json"))["cautions"][0]
+    assert "integrator contains" not in run("check", str(file))
+    assert "integrator contains" not in run("gains", str(file), *wall)
+
+
 @pytest.mark.parametrize(
     "controller, message",
     [
