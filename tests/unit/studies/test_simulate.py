@@ -227,6 +227,20 @@ def test_coupling_to_a_tool():
     assert panels[1].get_ylabel().startswith("coupling force")
 
 
+def test_figure_of_a_tool_names_its_lines():
+    wall = {"stiffness": 1e3, "virtual_damping": 5}
+    study = make_study(device=TOOL, start_position=1e-3, tool_position=0.0, walls=[wall])
+    panels = study.compute(None, True).figures[""]()
+    assert panels[0].get_ylabel().startswith("position")
+    assert [line.get_label().partition(",")[0] for line in panels[0].lines] == ["K = 1.000 kN/m", "tool_position_m"]
+    (curve,) = panels[1].lines
+    assert np.asarray(curve.get_ydata())[0] > 0
+    (legend,) = (each for each in (*panels[0].figure.legends, panels[0].get_legend()) if each is not None)
+    tool_line = legend.get_lines()[-1]
+    assert legend.get_texts()[-1].get_text() == "tool"
+    assert tool_line.get_color() == panels[0].lines[1].get_color() != panels[0].lines[0].get_color()
+
+
 @pytest.mark.parametrize(
     ("keys", "field", "message"),
     [
