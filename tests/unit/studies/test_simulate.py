@@ -65,7 +65,7 @@ def test_summary_agrees_with_the_simulation(impact, motion):
 def test_notes_state_the_final_state(impact):
     assert impact.notes[:2] == (
         "0.6 of K_max (linearly stable): comes to rest within 300 ms",
-        "0.95 of K_max (linearly stable): still decays after 300 ms",
+        "0.95 of K_max (linearly stable): still decays after 300 ms, amplitude 15.2 µm",
     )
     assert impact.notes[2].startswith("1.05 of K_max (linearly unstable): bounces: impact velocity from 144")
 
