@@ -67,8 +67,8 @@ class SlowToolLoop(LinearLoop):
     def roots(self) -> LoopRoots:
         """Poles and zeros of the loop without a wall; access raises `InputError`, because a periodic loop has none."""
         raise InputError(
-            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; with larger "
-            "values, only stability, spectral radius, poles, stable intervals and maximum stiffness are available"
+            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; for a slow "
+            "tool, choose K and B by the spectral radius and the stable intervals, which zwidth check prints"
         )
 
     @cached_property

@@ -25,6 +25,7 @@ from zwidth.cli.options import (
     SHARE,
     Parsed,
     beyond_safe_option,
+    code_option,
     figure_option,
     find_omitted,
     folder_argument,
@@ -74,16 +75,21 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @hardware_options
+@code_option
 @verbose_option
 @json_option
-def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
+def check(scene: Any, hardware: dict[str, Any], code: Any, verbose: bool, as_json: bool) -> None:
     """Assess one wall: stability, margins and passivity; for an unstable wall, the changes that stabilize it.
 
     The options --stiffness, --mass (or --device) and --rate (or --period) are required; the defaults of damping and
     delay are 0. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). With
     --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and saturation.
-    The exit code is 0 for stable and for unstable walls.
+    With --code, it prints only a program for the control loop, if the wall is stable. The exit code is 0 for stable and
+    for unstable walls.
     """
+    if code:
+        click.echo(scene.code(language=code, max_force=hardware.get("max_force", math.inf)), nl=False)
+        return
     from zwidth.analysis.assessment import assess, limits_of
     from zwidth.analysis.stabilization import stabilize
     from zwidth.app.verdict import format_check
@@ -188,7 +194,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the stability islands of a scene as dicts; None for a tool with ``every`` > 1 (not available)."""
+    """Return the separate stable regions as dicts; None for a tool that is integrated only every N > 1 periods."""
     return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
 
 
@@ -378,9 +384,7 @@ _DEGREES = Parsed("DEGREES", read_degrees, "write degrees, such as 30")
 @hardware_options
 @beyond_safe_option
 @figure_option
-@click.option(
-    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
-)
+@code_option
 @verbose_option
 @json_option
 def recommend(
@@ -397,11 +401,11 @@ def recommend(
     The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
     Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
     --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
-    requirements; --grasps does not replace them. With --passive only, the result is the stiffest passive wall, which
-    publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
-    --friction or --max-force, the command also simulates the wall to find limit cycles and saturation; --max-force also
-    limits the force in the code of --code. A hand (--operator-...) is a part of the device, and the command also checks
-    the wall without this hand. The exit code is 1 if no wall exists.
+    requirements; --grasps does not replace them. With --passive as the only requirement, the result is the stiffest
+    passive wall, as in publications on passivity; add --phase-margin 30 --gain-margin 2 to keep the default margins.
+    With --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and
+    saturation; --max-force also limits the force in the code of --code. A hand (--operator-...) is a part of the
+    device, and the command also checks the wall without this hand. The exit code is 1 if no wall exists.
     """
     from zwidth.app.verdict import format_recommendation
 

@@ -107,8 +107,8 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
         if "mass_matrix" in data or "model" in data:
-            # Use only the key ``rotary`` of an arm. The units of its joints, such as degrees and N m s/rad, imply
-            # nothing, because the wall may act on a linear motion of the arm.
+            # For an arm, return its key ``rotary``. Ignore the units of its joints, such as N m s/rad, because the
+            # wall may act on a linear motion of an arm with rotary joints.
             return data.get("rotary") is True
         return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
