@@ -302,7 +302,7 @@ class LinearLoop:
         return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def with_delay(self, delay: float) -> LoopRoots:
-        """Return the poles and zeros of the loop without a wall, with ``delay`` (in periods) in place of its delay."""
+        """Return the poles and zeros of the loop without a wall, for another delay, in periods."""
         return change_delay(self.chain, delay)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:

@@ -12,10 +12,10 @@ from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
-from zwidth.analysis.cautions import find_thin, price_passivity
+from zwidth.analysis.cautions import find_thin, price_passivity, summarize_thin
 from zwidth.analysis.optimization import explain_missing
 from zwidth.analysis.stabilization import stabilize
-from zwidth.app.gains import format_cascade
+from zwidth.app.gains import format_cascade, list_cascade_cautions
 from zwidth.app.printing import (
     format_diagnosis,
     format_hardware,
@@ -110,7 +110,8 @@ def format_check(
     alarm = spell_alarm(diagnosis, "exceeds the safe limit" if list_limit_cautions(scene) else "")
     lines = [format_line(word, wall_words + (alarm if word == "STABLE" else "")), format_line("device", device_words)]
     lines += [*format_parts(scene), *format_hardware(hardware)]
-    lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
+    cautions = [*list_omission_cautions(scene, omitted), *list_cascade_cautions(scene)]
+    lines += [format_line("CAUTION", text) for text in cautions]
     # With K = 0, print the stable dampings of a pure damper. Exclude measured responses, which have no poles and
     # therefore the frequency NaN.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency) and scene.loop.has_boundary
@@ -292,7 +293,7 @@ def format_recommendation(
     omission_lines = [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     if verdict is None:
         return [format_line("NO WALL", recommendation.reason), *device, *omission_lines]
-    thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
+    thin = summarize_thin(find_thin(verdict, scene.timing.period))
     alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a grasp")
     margins = [format_line("margins", recommendation.spell_margins())]
     if verbose:

@@ -16,7 +16,7 @@ import click
 
 from zwidth import __version__
 from zwidth.app import printing
-from zwidth.app.gains import list_cascade
+from zwidth.app.gains import list_cascade, list_cascade_cautions
 from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
@@ -103,6 +103,7 @@ def check(scene: Any, hardware: dict[str, Any], code: Any, verbose: bool, as_jso
         result["cautions"] = [
             *printing.list_limit_cautions(scene),
             *printing.list_omission_cautions(scene, find_omitted()),
+            *list_cascade_cautions(scene),
         ]
         result["islands"] = _list_islands(scene)
         unstable = verdict.stable is False and not verdict.marginal

@@ -69,7 +69,14 @@ class TracedDelayError(ZwidthError, TypeError):
 
 # Common names of quantities that are not names of fields, each with the name of the field that messages suggest
 # instead.
-SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
+SYNONYMS = {
+    "weight": "mass",
+    "inertia": "mass",
+    "frequency": "rate",
+    "latency": "delay",
+    "dead_time": "delay",
+    "bandwidth": "cutoff",
+}
 
 
 def format_install_command(extra: str) -> str:
