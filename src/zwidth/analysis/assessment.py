@@ -341,7 +341,7 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     if least is not None:
         softest = with_unit(round_conservatively(least * scene.units.stiffness, "above"), system["N/m"])
         lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
-    for island in scene.islands() if scene.loop.has_boundary else []:
+    for island in scene.islands() if scene.loop.has_pieces else []:
         units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
         ends = (f"{name} from {' to '.join(format_interval(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(f"an island of stable walls, {', '.join(ends)}, is not connected to K = 0 and excluded from K_max")

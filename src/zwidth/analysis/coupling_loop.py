@@ -29,7 +29,7 @@ from zwidth.stability.linear.coupled_controller import find_coupling_delay_margi
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.ridge import RidgeSolution
 from zwidth.stability.linear.roots import LoopRoots
-from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
+from zwidth.stability.linear.rows import CONNECTED_START, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
 from zwidth.units.quantities import WALL_RANGE
 
@@ -130,8 +130,17 @@ class CouplingLoop(LinearLoop):
             raise InputError("tool: the coupling is stable with every larger damping; choose B by spectral_radius")
         return super().find_connected_beta(alpha, least)
 
-    def islands(self, least: float) -> list[Island]:
-        return [] if self.unbounded else super().islands(least)
+    @property
+    def has_pieces(self) -> bool:
+        return not self.unbounded
+
+    def explain_limit(self) -> str:
+        if not self.unbounded:
+            return ""
+        return (
+            "stable couplings exist for arbitrarily large K, but no tested B is stable for every K > 0; choose K and B "
+            "by is_stable or stable_stiffness"
+        )
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         others = [name for name in Margins._fields if name in wanted and name != "delay_margin"]

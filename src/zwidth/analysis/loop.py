@@ -84,16 +84,20 @@ class LinearLoop:
     # Cache of computed ridges; the key is True if negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Default number of random devices in tolerance estimates. It is small, because K_max of one device takes 10 to 50
-    # ms.
+    # Default number of random devices in tolerance estimates; small, because K_max of a device takes 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods with arguments alpha and beta work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
     # Largest velocity window and delay, in periods, that searches in other modules try. It is limited, because the run
     # time increases with the square of window and delay.
     most_periods: ClassVar[float] = 128
-    # True if the stability boundary in the plane of alpha and beta is available, which margins and islands require.
+    # True if the stability boundary in the plane of alpha and beta is available, from which margins follow.
     has_boundary: ClassVar[bool] = True
+
+    @property
+    def has_pieces(self) -> bool:
+        """True if the connected pieces of the stable set are available, so that `islands` and `outlines` work."""
+        return self.has_boundary
 
     @cached_property
     def chain(self) -> AnyChain:
@@ -227,7 +231,7 @@ class LinearLoop:
         return []
 
     def explain_limit(self) -> str:
-        """Return the reason why the stiffest wall is undecided: "", because a model decides every wall."""
+        """Return the reason why the stiffest wall is not computed; "" if the message of its status suffices."""
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:

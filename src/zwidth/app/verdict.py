@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
 from zwidth.analysis.cautions import find_thin, price_passivity, summarize_thin
+from zwidth.analysis.optimization import explain_missing
 from zwidth.analysis.stabilization import stabilize
 from zwidth.app.gains import format_cascade, list_cascade_cautions
 from zwidth.app.printing import (
@@ -29,6 +30,7 @@ from zwidth.app.printing import (
     wrap_lines,
 )
 from zwidth.core.errors import InputError
+from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.safe_limit import reserve_damping
 from zwidth.stability.linear.passivity import find_obstacle
@@ -171,8 +173,11 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
     if isinf(verdict.stiffness_max):
         return [format_line("K_max", f"none: every K > 0 is stable at B = {damping} with this tool")]
     if not isfinite(verdict.stiffness_max):
-        none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
-        return [format_line("K_max", none)]
+        if isnan(verdict.frequency):
+            return [format_line("K_max", "the response certifies no wall")]
+        status = scene.max_stiffness().status
+        fault = "none" if status == Status.NO_BOUNDARY else "not computed"
+        return [format_line("K_max", f"{fault}: {explain_missing(scene, status)}")]
     top = f"{format_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [format_line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]

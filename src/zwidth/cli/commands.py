@@ -145,7 +145,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
-        fault = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
+        fault = "this device has no K_max" if none else "K_max of this device could not be computed"
         raise click.ClickException(f"{fault}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
@@ -195,8 +195,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the separate stable regions as dicts; None for a tool that is integrated only every N > 1 periods."""
-    return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
+    """Return the separate stable regions as dicts; None if they are not available with the tool of the scene."""
+    return [island._asdict() for island in scene.islands()] if scene.loop.has_pieces else None
 
 
 def _list_obstacles(scene: Any) -> list[str]:

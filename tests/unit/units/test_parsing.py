@@ -12,6 +12,7 @@ from zwidth.units.parsing import (
     ANGULAR_DAMPING,
     ANGULAR_SPEED,
     ANGULAR_STIFFNESS,
+    BANDWIDTH,
     DAMPING,
     DIMENSIONS,
     FORCE,
@@ -116,6 +117,9 @@ def test_quantity_is_the_float_nearest_to_the_text(dimension, text, value):
         (ANGULAR_DAMPING, "1 N m s/rev", 0.5 / math.pi),
         (INERTIA, "60 gcm2", 6e-6),
         (INERTIA, "60 g cm²", 6e-6),
+        (RATE, "1000 1/s", 1000.0),
+        (RATE, "5 1/s", 5.0),
+        (BANDWIDTH, "1 500 1/s", 1500.0),
     ],
 )
 def test_compound_and_customary_units_are_read(dimension, text, value):
