@@ -92,7 +92,7 @@ class LinearLoop:
     # Largest velocity window and delay, in periods, that searches in other modules try. It is limited, because the run
     # time increases with the square of window and delay.
     most_periods: ClassVar[float] = 128
-    # True if the stability boundary in the plane of alpha and beta is available, from which margins and islands follow.
+    # True if the stability boundary in the plane of alpha and beta is available, which margins and islands require.
     has_boundary: ClassVar[bool] = True
 
     @cached_property
@@ -298,7 +298,7 @@ class LinearLoop:
         return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def with_delay(self, delay: float) -> LoopRoots:
-        """Return the poles and zeros of the loop without a wall, with ``delay`` (in periods) in place of its delay."""
+        """Return the poles and zeros of the loop without a wall, for another delay, in periods."""
         return change_delay(self.chain, delay)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:

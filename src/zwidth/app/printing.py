@@ -291,9 +291,10 @@ def list_slopes(scene: Scene) -> list[Slope]:
         return []
     per, values = scene.sensitivities().per, scene.parameters()
     slopes, system = [], scene.unit_system
+    dampings = getattr(scene.device, "joint_dampings", {})
     for path, slope in per.items():
-        if path not in values:
-            # Skip the damping of a joint: its unit differs for hinges and slides, and the kind of joint is unknown.
+        if path in dampings:
+            slopes.append(_spell_joint_slope(path, float(slope), dampings[path], system["N/m"]))
             continue
         unit, value = system[get_unit(path)], float(slope)
         # The scale of a parameter is its absolute value, because modal masses and weights of feedback may be negative.
@@ -310,3 +311,20 @@ def list_slopes(scene: Scene) -> list[Slope]:
         words = f"{effect} for {with_unit(step, unit, 1)} more{note}"
         slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return slopes
+
+
+def _spell_joint_slope(path: str, slope: float, damping: float, unit: str) -> Slope:
+    """Return the derivative of K_max with respect to the damping of a joint, with its effect in words.
+
+    Args:
+        path: path of the damping.
+        slope: derivative, per N m s/rad (hinges) or per N s/m (slides).
+        damping: value of the damping in the same unit.
+        unit: unit of K_max.
+    """
+    # Name no unit of the damping, because hinges and slides have different units, and the kind of joint is not stored.
+    step, words = (0.1 * damping, "10 % more") if damping > 0 else (1e-3, "a damping of 0.001")
+    effect = "no change" if isfinite(slope) else "not computed"
+    if isfinite(slope) and (change := slope * step):
+        effect = f"{'+' if change > 0 else '-'}{with_unit(abs(change), unit, 3)}"
+    return Slope(path, slope, f"{unit} per SI unit", f"{effect} for {words}")

@@ -12,7 +12,7 @@ from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
-from zwidth.analysis.cautions import find_thin, price_passivity
+from zwidth.analysis.cautions import find_thin, price_passivity, summarize_thin
 from zwidth.analysis.stabilization import stabilize
 from zwidth.app.gains import format_cascade, list_cascade_cautions
 from zwidth.app.printing import (
@@ -288,7 +288,7 @@ def format_recommendation(
     omission_lines = [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     if verdict is None:
         return [format_line("NO WALL", recommendation.reason), *device, *omission_lines]
-    thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
+    thin = summarize_thin(find_thin(verdict, scene.timing.period))
     alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a grasp")
     margins = [format_line("margins", recommendation.spell_margins())]
     if verbose:

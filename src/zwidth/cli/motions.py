@@ -65,10 +65,12 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 def _list_thin_margins(scene: Any) -> list[str]:
     """Return a list with one caution that names the small margins of a stable wall; empty if all are large enough."""
     from zwidth.analysis.assessment import assess
-    from zwidth.analysis.cautions import find_thin
+    from zwidth.analysis.cautions import explain_slow, find_thin
 
     verdict = assess(scene)
     thin = find_thin(verdict, scene.timing.period) if verdict.stable else []
+    if cause := explain_slow(scene, verdict, thin):
+        return [f"{thin[0]}: {cause}"]
     return [f"{', '.join(thin)}: see zwidth recommend for a wall with larger margins"] if thin else []
 
 

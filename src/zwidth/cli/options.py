@@ -334,7 +334,8 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     if published:
         _check_published(published, given, missing)
     if missing:
-        raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
+        normalized = f"; for normalized parameters, give only {instead}" if instead else ""
+        raise click.UsageError(f"give {', and '.join(missing)}{normalized}")
 
     def select(*names: str) -> dict[str, Any]:
         """Return the values that are given among the named parameters, as a dict by name."""

@@ -49,8 +49,9 @@ class MassMatrixSection(PartSection, noun="a device with joints"):
     all joints, a list with one number per joint, or a matrix."""
 
     jacobian: _Matrix | None = None
-    """Jacobian of the point on which the wall acts: one row per axis, one column per joint. The column of a joint
-    without motor contains zeros. Default: the identity matrix; the direction is then in joint coordinates."""
+    """Jacobian of the point on which the wall acts: one row per axis, one column per joint. Entries are numbers
+    in SI units, or lengths such as 20 cm. The column of a joint without motor contains zeros. Default: the identity
+    matrix; the direction is then in joint coordinates."""
 
     direction: _Direction | None = None
     """Direction of the wall: x, y or z, or a vector with one component per row of the Jacobian. Required unless the

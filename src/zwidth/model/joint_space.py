@@ -139,7 +139,8 @@ def from_mass_matrix(
         direction: direction n of the wall, of any length > 0: "x", "y" or "z", or a vector with one component per row
             of the Jacobian. It may be omitted if the Jacobian has a single row.
         jacobian: Jacobian J of the point, with one column per joint and one row per axis: the velocity of the point is
-            ``J q'`` for the joint velocities q'. None if ``direction`` is in joint coordinates.
+            ``J q'`` for the joint velocities q'. Entries are numbers in SI units, or lengths with a unit such as
+            "20 cm". None if ``direction`` is in joint coordinates.
         stiffness: stiffness of springs from the joints to ground in N m/rad or N/m, in the same form as ``damping``. A
             spring k between two coordinates has the matrix ``[[k, -k], [-k, k]]``.
         rotary: True if the direction is an axis of rotation; walls are then in N m/rad and N m s/rad.
@@ -166,7 +167,7 @@ def from_mass_matrix(
     """
     inertia = _read_matrix("mass_matrix", mass_matrix, None)
     joints = len(inertia)
-    vector = _project(direction, jacobian, joints)
+    vector = _project(direction, jacobian, joints, rotary=rotary)
     damper, spring = (
         _read_matrix(name, value, joints) for name, value in (("damping", damping), ("stiffness", stiffness))
     )
@@ -206,8 +207,11 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
         array = np.diag(np.broadcast_to(array, joints))
     shape = (joints, joints) if joints is not None else (len(array),) * 2 if array.ndim == 2 else None
     if array.shape != shape or not array.size:
-        allowed = "(joints, joints)" if joints is None else f"({joints}, {joints})"
-        raise InputError(f"{name}: got shape {array.shape}; it must be {allowed}")
+        got = f"shape {array.shape}" if array.ndim else "one number"
+        allowed = "a square matrix" if joints is None else f"a matrix of shape ({joints}, {joints})"
+        raise InputError(
+            f"{name}: got {got}; it must be {allowed} with one row per joint, such as [[0.03, 0], [0, 0.01]]"
+        )
     if not np.isfinite(array).all():
         raise InputError(f"{name}: got a value that is not finite; all must be finite numbers")
     size = np.abs(array).max()
@@ -225,22 +229,32 @@ def _convert_units(name: str, value: Any) -> Any:
     """Return a matrix, a vector or a number with all strings, such as "20 mN m s/rad", in SI units.
 
     ``name`` is the name of the field, which determines the dimension: a mass, a damping or a stiffness, in the units of
-    rotation for hinges and of translation for slides.
+    rotation for hinges and of translation for slides; or a length for the Jacobian of hinges.
     """
     if isinstance(value, list | tuple):
         return [_convert_units(name, entry) for entry in value]
     if not isinstance(value, str):
         return value
-    return check_number(name, value, SYSTEMS[detect_kind(value) is not False][_UNITS[name]], ANY)
+    unit = "m" if name == "jacobian" else SYSTEMS[detect_kind(value) is not False][_UNITS[name]]
+    return check_number(name, value, unit, ANY)
 
 
-def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
-    """Return the joint torques J' n for a unit force along the direction n, with the Jacobian J; shape (joints,)."""
-    rows = np.eye(joints) if jacobian is None else _read_array("jacobian", jacobian)
+def _project(direction: Any, jacobian: Any, joints: int, *, rotary: bool) -> np.ndarray:
+    """Return the joint torques J' n for a unit force along the direction n, with the Jacobian J; shape (joints,).
+
+    The Jacobian of a rotary device has no lengths.
+    """
+    rows = np.eye(joints) if jacobian is None else _read_array("jacobian", jacobian, lengths=not rotary)
     if rows.ndim != 2 or rows.shape[1] != joints:
         raise InputError(f"jacobian: got shape {rows.shape}; it must be (axes, {joints}), one column per joint")
     if isinstance(direction, str):
         check_choice("direction", direction, tuple(_AXES))
+        names = list(_AXES)[: len(rows)]
+        if direction not in names:
+            raise InputError(
+                f"direction: got {direction!r}; the Jacobian has {len(rows)} row{'s' * (len(rows) > 1)}; use "
+                f"{' or '.join(map(repr, names))}, or add a row for each further axis"
+            )
         direction = _AXES[direction][: len(rows)]
     if direction is None and len(rows) > 1:
         raise InputError(f"direction: missing; give a vector of {len(rows)} components, or 'x', 'y' or 'z'")
@@ -255,14 +269,23 @@ def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
     return vector
 
 
-def _read_array(name: str, value: Any) -> np.ndarray:
-    """Convert a value to an array of finite numbers; ``name`` is the name of the field in error messages."""
+def _read_array(name: str, value: Any, *, lengths: bool = False) -> np.ndarray:
+    """Convert a value to an array of finite numbers.
+
+    Args:
+        name: name of the field in error messages.
+        value: value to convert.
+        lengths: True if texts with a unit of length are allowed.
+    """
     try:
-        array = np.array(value, float)
+        array = np.array(_convert_units(name, value) if lengths else value, float)
+    except InputError:
+        raise
     except (TypeError, ValueError):
         array = np.array(np.nan)
     if not np.isfinite(array).all():
-        raise InputError(f"{name}: got {value!r}; it must be finite numbers in SI units")
+        unit = ", or texts with a unit of length" if lengths else ""
+        raise InputError(f"{name}: got {value!r}; it must be finite numbers{unit}")
     return array
 
 

@@ -284,7 +284,8 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         allowed, remedy = "it must be a number without a unit", f"write a number, e.g. {dimension.example}"
     text = _drop_separators(text)
     if looks_like_number(text) and not looks_like_number(str(value)):
-        raise UnusableValueError(got, "numbers without a unit have no separators", f"write {text}")
+        condition = " if the comma is a decimal point" if "." in text and "." not in str(value) else ""
+        raise UnusableValueError(got, "it must be one number without separators", f"write {text}{condition}")
     if looks_like_number(text):
         note = f" (it is then in {dimension.base})" if dimension.base else ""
         raise UnusableValueError(f"got the text {describe(value)}", allowed, f"drop the quotes{note}")

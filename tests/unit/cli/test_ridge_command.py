@@ -112,3 +112,19 @@ def test_largest_coupling_in_a_narrow_region_is_named(tool, narrow):
     checked = CliRunner().invoke(cli, ["check", *system, *wall])
     assert checked.output.startswith("UNSTABLE" if narrow else "STABLE")
     assert any("do not set a coupling near K_max" in note for note in found["notes"]) == narrow
+
+
+@pytest.mark.parametrize(
+    ("damping", "effect"),
+    [
+        ("[0.02, 0.05]", r"joints\.1\.damping\)  .* kN/m per SI unit: \+\d+ N/m for 10 % more"),
+        ("[0, 0.05]", r"joints\.0\.damping\)  .* N/m per SI unit: .* for a damping of 0\.001"),
+    ],
+)
+def test_joint_dampings_have_sensitivities(tmp_path, damping, effect):
+    file = tmp_path / "arm.yaml"
+    matrix, jacobian = "[[0.003, 0.001], [0.001, 0.001]]", "[[-0.2, -0.1], [0.1, 0.1]]"
+    file.write_text(
+        f"mass_matrix: {matrix}\njacobian: {jacobian}\ndamping: {damping}\ndirection: y\n", encoding="utf-8"
+    )
+    assert re.search(effect, ridge("--device", str(file), "--rate", "1 kHz", "--delay", "1 ms"))

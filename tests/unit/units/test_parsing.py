@@ -180,7 +180,8 @@ def test_suggestion_has_the_same_magnitude(dimension, text, suggestion):
     [
         ("1,000 N/m", "the comma is ambiguous: decimal or thousands separator; write '1000 N/m' or '1.000 N/m'"),
         ("1,00,0.5 N/m", "not in groups of three"),
-        ("1,5", "have no separators; write 1.5"),
+        ("1,5", "it must be one number without separators; write 1.5"),
+        ("1000,2000", "it must be one number without separators; write 1000.2000 if the comma is a decimal point"),
     ],
 )
 def test_ambiguous_separators_are_rejected(text, message):
