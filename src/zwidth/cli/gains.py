@@ -118,12 +118,16 @@ def _find_kind(given: dict[str, float], section: ControllerSection | None) -> Co
 
 
 def _read_section(file: Path | None, scene: Any) -> ControllerSection | None:
-    """Return the section ``controller`` of a scene file; None without a file or if its scene has no such section."""
+    """Return the section ``controller`` of a scene file or of the run in a folder; None without such a section."""
     from zwidth.config.controllers import read_controller
     from zwidth.config.reader import read_section
     from zwidth.config.values import read_in_units
+    from zwidth.runs.record import find_config
 
-    if file is None or file.is_dir() or (raw := read_section(file, "scene", "controller")) is None:
+    if file is None:
+        return None
+    raw = read_section(find_config(file) if file.is_dir() else file, "scene", "controller")
+    if raw is None:
         return None
     with read_in_units(scene.unit_system):
         section = read_controller(raw)

@@ -152,6 +152,10 @@ def test_options_override_single_gains_of_a_file(tmp_path):
     result = json.loads(run("gains", str(file), "--vel-integrator-gain", "3", "--json"))
     assert result["gains"] == expected["gains"]
     assert result["check"]["spectral_radius"] == pytest.approx(expected["check"]["spectral_radius"], rel=1e-12)
+    # The folder of a run contains the configuration with the controller.
+    folder = tmp_path / "motor"
+    run("run", str(file), "--out", str(folder))
+    assert json.loads(run("gains", str(folder), "--vel-integrator-gain", "3", "--json")) == result
     # A new torque constant leaves K and B of the file unchanged, and the gains change.
     result = json.loads(run("gains", str(file), "--torque-constant", "0.02", "--json"))
     assert result["gains"]["cascade"]["vel_gain"] == pytest.approx(8)
@@ -168,7 +172,8 @@ def test_an_unstable_controller_has_limits_and_a_remedy(gains):
     options = ["gains", "--pos-gain", str(gains[0]), "--vel-gain", str(gains[1]), *NUMBERS, *PLL]
     text = " ".join(run(*options).split())
     result = json.loads(run(*options, "--json"))
-    assert "UNSTABLE" in text and "remedy set " in text
+    assert "UNSTABLE" in text
+    assert "remedy set " in text
     assert "use zwidth recommend" in text
     device = zwidth.Device("1e-4 kg m^2", "1e-4 N m s/rad")
     timing = zwidth.Timing(rate="8 kHz", delay="1.5 periods")
