@@ -110,7 +110,10 @@ def test_display_without_damping_has_no_limit():
         ([*DISPLAY, *LAG, *LOOP, "--period", "1 ms"], "give either --rate or --period"),
         (["display.yaml"], "got 'display.yaml', but this command has only options; for a file with a study of kind"),
         (["display.yaml"], "use zwidth run display.yaml"),
-        ([*DISPLAY, *LAG, *LOOP, "--robot-cutoff", "10"], "got both --robot-cutoff and --robot-time-constant; give only"),
+        (
+            [*DISPLAY, *LAG, *LOOP, "--robot-cutoff", "10"],
+            "got both --robot-cutoff and --robot-time-constant",
+        ),
         ([*DISPLAY, *LOOP, "--robot-order", "2"], "either --robot-time-constant or --robot-cutoff"),
         ([*DISPLAY, *LAG, *LOOP, "--robot-sampled"], "--robot-sampled: give --robot"),
         (["--virtual-mass", "20 N", "--virtual-damping", "1"], "'--virtual-mass': got '20 N'"),
