@@ -40,7 +40,7 @@ from zwidth.model.checks import Part, check_number, find_kind, read_texts
 from zwidth.model.exact_polynomials import multiply
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.timing import Timing
-from zwidth.numerics.evaluate import as_float64, broadcast_traced
+from zwidth.numerics.evaluate import as_float64, broadcast, broadcast_traced
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE, Range
 from zwidth.units.unit_system import SYSTEMS
@@ -53,7 +53,10 @@ _QUANTITIES = {
 }
 
 
-@compact_repr(frequency="Hz")
+_UNSTABLE = "The display is unstable even in soft environments; change the virtual damping or reduce the delay."
+
+
+@compact_repr(messages={Status.NO_BOUNDARY: _UNSTABLE}, frequency="Hz")
 class EnvironmentLimit(NamedTuple):
     """The largest stiffness K of the environment such that an admittance display is stable from 0 to K.
 
@@ -66,7 +69,10 @@ class EnvironmentLimit(NamedTuple):
     status: Array
 
 
-@compact_repr(virtual_mass="kg", largest="kg", frequency="Hz")
+_NO_MASS = "The display is unstable with every virtual mass; change the virtual damping or reduce the delay."
+
+
+@compact_repr(messages={Status.NO_BOUNDARY: _NO_MASS}, virtual_mass="kg", largest="kg", frequency="Hz")
 class VirtualMassLimit(NamedTuple):
     """The smallest virtual mass with which an admittance display is stable.
 
@@ -81,7 +87,10 @@ class VirtualMassLimit(NamedTuple):
     status: int
 
 
-@compact_repr(virtual_damping="N s/m", largest="N s/m", frequency="Hz")
+_NO_DAMPING = "The display is unstable with every virtual damping; change the virtual mass or reduce the delay."
+
+
+@compact_repr(messages={Status.NO_BOUNDARY: _NO_DAMPING}, virtual_damping="N s/m", largest="N s/m", frequency="Hz")
 class VirtualDampingLimit(NamedTuple):
     """The smallest virtual damping with which an admittance display is stable.
 
@@ -213,7 +222,8 @@ class AdmittanceDisplay(Part):
             "environment_stiffness",
             read_texts("environment_stiffness", environment_stiffness, SYSTEMS[self.rotary]["N/m"]),
         )
-        K, B = np.broadcast_arrays(K, self._read_array("environment_damping", environment_damping))
+        B = self._read_array("environment_damping", environment_damping)
+        K, B = broadcast({"environment_stiffness": K, "environment_damping": B})
         if not np.all(B >= 0):
             raise InputError(f"environment_damping: got {float(B[~(B >= 0)].flat[0]):g} N s/m; it must be >= 0")
         labels = np.zeros(K.shape, bool)
@@ -262,7 +272,7 @@ class AdmittanceDisplay(Part):
         given: dict[str, Any] = dict(zip(names, (M, D, environment_damping), strict=True))
         if is_traced(*given.values(), *list_leaves(self)):
             return self._trace_limit(given)
-        factors = np.broadcast_arrays(*(self._read_array(name, value) for name, value in given.items()))
+        factors = broadcast({name: self._read_array(name, value) for name, value in given.items()})
         self.loop.check_damper(float(np.nanmax(factors[2], initial=0.0)))
         K, frequency, status = (each.reshape(factors[0].shape)[()] for each in self._find_limits(*factors))
         return self._label(EnvironmentLimit(K, frequency, status))
@@ -404,7 +414,9 @@ class AdmittanceDisplay(Part):
         )
         # With the gain 1/M, the characteristic polynomial divided by M is p_M + (1/M) rest, so p_M is the denominator.
         system = (rest, parts[gain]) if gain == "mass" else (parts[gain], rest)
-        return Scene(LinearDevice(system, float(self.timing.period)), Timing(float(self.timing.period)))
+        device = LinearDevice(system, float(self.timing.period))
+        object.__setattr__(device, "is_display", True)
+        return Scene(device, Timing(float(self.timing.period)))
 
     def _find_limit(self, factors: dict[str, float]) -> tuple[float, float, int]:
         """Return the largest K such that the display is stable from 0 to K, the frequency in Hz at K, and a status."""

@@ -425,6 +425,11 @@ class SceneAdvice(SceneOptima):
             >>> scene.recommend().limited_by
             'phase_margin'
         """
+        if getattr(self.device, "is_display", False):
+            raise InputError(
+                "recommend: got the scene of an admittance display, where K and B belong to the environment; use "
+                "min_virtual_mass or min_virtual_damping of the display"
+            )
         requirements = Requirements.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
         if requirements.passive and (obstacle := find_obstacle(self)):
             raise InputError(f"passive: got True {obstacle}")

@@ -42,6 +42,13 @@ def _add_lag(command: Any) -> Any:
     return command
 
 
+def _refuse_files(_context: click.Context, _argument: click.Parameter, files: tuple[str, ...]) -> None:
+    """Raise `click.UsageError` if an argument without option is given, such as the path of a file."""
+    if files:
+        text = f"got {files[0]!r}, but this command has only options; for a file with a study"
+        raise click.UsageError(f"{text} of kind admittance, use zwidth run {files[0]}")
+
+
 @cli.command(
     **show_example(
         "admittance --virtual-mass '20 kg' --virtual-damping '60 N s/m'",
@@ -50,6 +57,7 @@ def _add_lag(command: Any) -> Any:
     ),
     own=("--virtual-damping",),
 )
+@click.argument("files", nargs=-1, metavar="", is_eager=True, expose_value=False, callback=_refuse_files)
 @click.option("--virtual-mass", type=quantity_type("kg", POSITIVE), required=True, help="Virtual mass M, in kg.")
 @click.option(
     "--virtual-damping", type=quantity_type("N s/m", NOT_NEGATIVE), required=True, help="Virtual damping D, in N s/m."
@@ -145,6 +153,10 @@ def _make_display(
     parameters = {name.removeprefix("robot_"): value for name, value in lag.items() if value is not None}
     if (robot is None) == (not parameters):
         raise click.UsageError("give a model of the robot, either --robot-time-constant (or --robot-cutoff) or --robot")
+    if {"cutoff", "time_constant"} <= parameters.keys():
+        raise click.UsageError("got both --robot-cutoff and --robot-time-constant; give only one of them")
+    if parameters and not {"cutoff", "time_constant"} & parameters.keys():
+        raise click.UsageError("give the lag of the robot, either --robot-time-constant or --robot-cutoff")
     if robot_sampled and robot is None:
         raise click.UsageError("--robot-sampled: give --robot 'NUM / DEN' with coefficients in z")
     loop_timing = Timing(**timing)
@@ -216,7 +228,7 @@ def _assess(display: Any, stiffness: float, damping: float, limit: Any) -> tuple
     lines = [format_line("STABLE" if is_stable else "UNSTABLE", f"in an environment with K = {K}, B = {B}")]
     if is_stable:
         gain, phase, modulus = (
-            round_conservatively(result[f"{name}_margin"], "below", 3) for name in ("gain", "phase", "modulus")
+            round_conservatively(result[f"{name}_margin"], "below") for name in ("gain", "phase", "modulus")
         )
         place = with_unit(float(margins.gain_crossover), "Hz", 3)
         text = f"gain {plain(gain)}, phase {plain(phase)} deg at {place}, modulus {plain(modulus)}"

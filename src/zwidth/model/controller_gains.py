@@ -96,6 +96,12 @@ def _read_gain(name: str, gain: Any) -> Any:
     return check_number(name, gain, "1", ANY)
 
 
+def _check_position(position: Any) -> None:
+    """Raise `InputError` if a position estimate is neither None nor an object such as a PLL."""
+    if position is not None and not isinstance(position, Position):
+        raise InputError(f"position: got {position!r}; pass an object such as zwidth.Pll(bandwidth=1000), or omit it")
+
+
 def pid(
     kp: float,
     ki: float = 0.0,
@@ -135,6 +141,7 @@ def pid(
     """
     scale = _find_scale(units, output_unit)
     kp, ki, kd = (_read_gain(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+    _check_position(position)
     velocity: Any = BackwardDifference() if derivative_filter is None else derivative_filter
     if isinstance(velocity, int | float | str):
         velocity = LowPass(time_constant=velocity)
@@ -225,6 +232,7 @@ def cascade(
         >>> print(f"{scene.spectral_radius():.9f}")
         0.997411977
     """
+    _check_position(position)
     if velocity is not None and has_velocity(position):
         raise InputError(f"velocity: got {velocity!r}, but {position!r} has its own velocity estimate; omit velocity")
     scale = _find_scale(units, output_unit)

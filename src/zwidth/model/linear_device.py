@@ -58,6 +58,8 @@ class ResponseDevice:
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
     rotary: bool = False
+    # True if the device is an admittance display: K and B of a scene are then those of its environment.
+    is_display: bool = False
     # The damping is 0, because the response already includes the physical damping.
     damping: ClassVar[float] = 0.0
 

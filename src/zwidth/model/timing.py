@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
@@ -12,6 +14,14 @@ from zwidth.core.errors import InputError
 from zwidth.core.xp import is_jax, is_traced
 from zwidth.model.checks import Part, Span, check_number, check_span, to_periods
 from zwidth.units.formatting import format_periods, with_unit
+from zwidth.units.plausibility import list_implausible
+from zwidth.units.unit_system import LINEAR
+
+# Limits of plain numbers; from these, a number was probably meant in another unit, and `Timing` issues a warning.
+_LONG_PERIOD = 10.0  # s
+_LONG_DELAY = 0.5  # s
+_MANY_PERIODS = 50.0  # sampling periods; the warning requires that the delay reaches both limits
+_NORMALIZED = 0.5  # s; loops with longer periods are probably normalized (T = 1), so no delay causes a warning
 
 
 @dataclass(frozen=True, repr=False)
@@ -25,6 +35,10 @@ class Timing(Part):
             A JAX derivative with respect to such a delay is per period of delay; in the gradient of a scene, it is
             the number ``gradient.timing.span.value``.
         rate: sampling rate 1/T in Hz, > 0.
+
+    Numerics:
+        Plain numbers that were probably meant in another unit cause a `UserWarning`: a period of 10 s or more, and a
+        delay of 0.5 s or more that is also at least 50 periods. Write such values with their unit, "1 s", to avoid it.
 
     Example:
         >>> import zwidth
@@ -45,6 +59,7 @@ class Timing(Part):
         if (self.period is None) == (self.rate is None):
             both = "" if self.rate is None else "got both; "
             raise InputError(f"timing: {both}pass either period (s) or rate (Hz), and only one of them")
+        given = {"period": self.period, "delay": self.delay}
         if self.rate is not None:
             object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate))
             object.__setattr__(self, "rate", None)
@@ -54,6 +69,24 @@ class Timing(Part):
             object.__setattr__(self, "in_periods", delay.unit == "periods")
             object.__setattr__(self, "_periods", delay.value if self.in_periods else None)
             object.__setattr__(self, "delay", delay.seconds(self.period))
+        # Warn only if the user's code creates the timing, because zwidth and `dataclasses.replace` pass all delays as
+        # numbers. Frame 1 is the constructor, and frame 2 is its caller.
+        caller = sys._getframe(2).f_globals.get("__name__", "").partition(".")[0]
+        if caller not in ("zwidth", "dataclasses"):
+            self._warn_of_units(given)
+
+    def _warn_of_units(self, given: dict[str, Any]) -> None:
+        """Issue a warning if period or delay is a plain number that was probably meant in another unit."""
+        least = {"period": _LONG_PERIOD, "delay": _LONG_DELAY}
+        long = {name: v for name, v in given.items() if isinstance(v, int | float) and v >= least[name]}
+        if "delay" in long and (self.d < _MANY_PERIODS or self.period > _NORMALIZED):
+            del long["delay"]
+
+        def spell(name: str, value: str) -> str:
+            return f"{name}={value!r}" if value else name
+
+        for text in list_implausible(long, spell, LINEAR):
+            warnings.warn(text, UserWarning, stacklevel=4)
 
     def __repr__(self) -> str:
         """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""

@@ -31,6 +31,7 @@ def compact_repr(
     only: Sequence[str] = (),
     picture: Callable[[Any], str] | None = None,
     missing: Mapping[str, str] = MappingProxyType({}),
+    messages: Mapping[Status, str] = MappingProxyType({}),
     **units: Unit,
 ) -> Callable[[Kind], Kind]:
     """Return a class decorator that adds a short ``repr`` and an HTML table to a dataclass or named tuple of results.
@@ -41,6 +42,7 @@ def compact_repr(
         only: names of the displayed fields; empty for all fields.
         picture: function that returns an HTML picture of the result, to be displayed after the table.
         missing: reasons for NaN, by field.
+        messages: texts for status codes, in place of the general messages in `core.status`.
         **units: units on a linear device, or enumerations of codes, by field. Defaults exist for ``stiffness``,
             ``virtual_damping`` and ``status``.
     """
@@ -64,7 +66,7 @@ def compact_repr(
         all_units = _DEFAULT_UNITS | units
 
         def spell(self: Any, name: str, value: Any) -> str:
-            text = format_value(value, find_unit(self, all_units.get(name, "")))
+            text = format_value(value, find_unit(self, all_units.get(name, "")), messages)
             if name in missing and "NaN" in text:
                 text += f"{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
             return text
@@ -118,8 +120,14 @@ def with_units(result: Result, system: UnitSystem | None) -> Result:
     return result
 
 
-def format_value(value: Any, unit: Unit = "") -> str:
-    """Format a value as a short text; a large array as its shape, range and number of NaN."""
+def format_value(value: Any, unit: Unit = "", messages: Mapping[Status, str] = MappingProxyType({})) -> str:
+    """Format a value as a short text; a large array as its shape, range and number of NaN.
+
+    Args:
+        value: the value.
+        unit: its unit, or the enumeration to which its codes belong.
+        messages: texts for status codes, in place of the general messages in `core.status`.
+    """
     if isinstance(value, str):
         return value or "''"
     if isinstance(value, bool | np.bool_) or value is None:
@@ -138,7 +146,7 @@ def format_value(value: Any, unit: Unit = "") -> str:
     if array.ndim == 0:
         number = array[()]
         code = Status(int(number)) if unit is Status else Status.OK
-        return _spell_number(number, unit) + (f": {code.message}" if code != Status.OK else "")
+        return _spell_number(number, unit) + (f": {messages.get(code, code.message)}" if code != Status.OK else "")
     if array.size <= _FEW:
         return f"[{', '.join(_spell_number(each, unit) for each in array.ravel())}]"
     return f"array {array.shape}, {_spell_range(array, unit)}".replace(",)", ")")

@@ -209,3 +209,17 @@ def test_robots_with_very_fast_and_very_slow_modes():
             intervals = single.scene(0, [0, 5e-4][j]).stable_stiffness(0.0)
             assert intervals[0, 0] <= 0
             assert limits.stiffness[i, j] == pytest.approx(intervals[0, 1], rel=1e-9)
+
+
+def test_messages_name_the_display_and_the_remedy():
+    timing = zwidth.Timing(rate="500 Hz", delay="4 periods")
+    display = zwidth.AdmittanceDisplay(20, 0, zwidth.Actuator(time_constant="20 ms"), timing)
+    assert "NO_BOUNDARY: The display is unstable with every virtual mass; change" in repr(display.min_virtual_mass(500))
+    assert "NO_BOUNDARY: The display is unstable even in soft" in repr(display.max_environment_stiffness())
+    with pytest.raises(zwidth.InputError, match=r"do not broadcast: virtual_mass \(3,\), virtual_damping \(2,\)"):
+        display.max_environment_stiffness(virtual_mass=[1, 2, 3], virtual_damping=[60, 70])
+    with pytest.raises(zwidth.InputError, match="do not broadcast: environment_stiffness"):
+        display.is_stable([100, 200], [1, 2, 3])
+    for scene in (display.scene(100), display.scene().replace(stiffness=200)):
+        with pytest.raises(zwidth.InputError, match=r"recommend: got the scene of an adm.*min_virtual_mass"):
+            scene.recommend()

@@ -71,3 +71,11 @@ def test_the_result_does_not_depend_on_the_given_pos_gain():
     low, high = recommend(20), recommend(20_000)
     assert high.stiffness == pytest.approx(low.stiffness, rel=1e-3)
     assert high.cascade_gains() == pytest.approx(low.cascade_gains(), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda wrong: zwidth.cascade(20, 0.1, position=wrong), lambda wrong: zwidth.pid(9, position=wrong)]
+)
+def test_position_estimate_must_be_an_object(make):
+    with pytest.raises(InputError, match=r"position: got 1000; pass an object such as zwidth.Pll"):
+        make(1000)

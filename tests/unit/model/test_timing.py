@@ -89,3 +89,27 @@ def test_a_gradient_prints_no_delay_in_periods(x64):
     moved = jax.tree.map(lambda value, slope: value + 1e-16 * slope, scene, gradient)
     assert "periods" in repr(moved)
     assert float(moved.timing.delay) == pytest.approx(1.3e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((1e-3, 1), "delay is 1 s, an implausible value; did you mean delay='1 ms' or delay='1 periods'"),
+        ((1 / 8e3, 1.5), "delay is 1.5 s, an implausible value; did you mean delay='1.5 ms' or delay='1.5 periods'"),
+        ((1000,), "period is 1000 s, an implausible value; did you mean rate='1000 Hz'"),
+    ],
+)
+def test_plain_numbers_of_another_unit_cause_a_warning(arguments, message):
+    with pytest.warns(UserWarning, match=message) as record:
+        timing = zwidth.Timing(*arguments)
+    assert [each.filename for each in record] == [__file__]
+    assert timing.period == arguments[0]
+
+
+def test_long_values_with_units_cause_no_warning():
+    timing = zwidth.Timing("1 ms", "1 s")
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), timing).replace(mass=0.2)
+    assert scene.timing.delay == 1
+    assert zwidth.Timing(0.1, 1).d == 10
+    assert zwidth.Timing(1, 60).d == 60
+    assert zwidth.Timing("1000 s").period == 1000

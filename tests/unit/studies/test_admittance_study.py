@@ -1,5 +1,7 @@
 """The admittance study: limits and virtual masses against `zwidth.AdmittanceDisplay`, units, and messages."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from sweeping import run_main
@@ -69,6 +71,21 @@ def test_displays_without_limit_are_noted(tmp_path, capsys):
     assert run_main("run", write_config(tmp_path, study), "--out", tmp_path / "out") == 0
     captured = capsys.readouterr()
     assert "4 of 8 displays have no result: 4 no boundary" in captured.out + captured.err
+
+
+@pytest.mark.parametrize("spacing", ["linear", "log"])
+def test_many_dampings_have_a_color_bar_instead_of_a_legend(tmp_path, spacing):
+    dampings = f"{{{spacing}: {{start: 20, stop: 600, num: 60}}}}"
+    study: Any = load_config(write_config(tmp_path, STUDY.replace("[60, 200 N s/m]", dampings))).studies[0]
+    (ax,) = study.compute(None, True).figures[""]()
+    figure = ax.figure
+    assert [each.get_ylabel() for each in figure.axes[1:]] == ["virtual damping  $D$  in N s/m"]
+    entries = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert len(entries) == 4
+    assert entries[0].startswith("delay 1 period")
+    # The layout engine issues a warning, an error in tests, if the legend leaves no space for the panel.
+    figure.draw_without_rendering()
+    assert ax.get_position().height > 0.5
 
 
 @pytest.mark.parametrize(
