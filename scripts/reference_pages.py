@@ -135,6 +135,13 @@ def _describe_keys(model: dict[str, Any], models: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _describe_list(entry: str) -> str:
+    """Return the description of a list from that of its entries; plain numbers and their lists in the plural."""
+    if entry == "number":
+        return "list of numbers"
+    return f"list of lists{entry[4:]}" if entry.startswith("list of ") else f"list: {entry}"
+
+
 def _describe_value(value: dict[str, Any], models: dict[str, Any]) -> str:
     """Return the values that a key allows, in words."""
     if "$ref" in value:
@@ -159,7 +166,7 @@ def _describe_value(value: dict[str, Any], models: dict[str, Any]) -> str:
     types = value.get("type", "")
     kind = str(next(each for each in types if each != "null") if isinstance(types, list) else types)
     if kind == "array":
-        return f"list: {_describe_value(value.get('items', {}), models)}" if value.get("items") else "list"
+        return _describe_list(_describe_value(value["items"], models)) if value.get("items") else "list"
     limits = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
     ends = [f"{word} {value[name]:g}" for name, word in limits.items() if name in value]
     return ", ".join([{"string": "text", "boolean": "true or false", "object": "mapping"}.get(kind, kind), *ends])

@@ -95,8 +95,8 @@ class VirtualDampingLimit(NamedTuple):
     """The smallest virtual damping with which an admittance display is stable.
 
     The display is stable with every damping from ``virtual_damping`` to ``largest``, both in N s/m. ``frequency`` is
-    the frequency in Hz of the oscillation with the smallest damping; it is NaN if that damping is 0. If no damping is
-    stable, all three are NaN and ``status`` is NO_BOUNDARY.
+    the frequency in Hz of the sustained oscillation with the damping ``virtual_damping``; NaN if this damping is 0. If
+    the display is unstable with every damping, all three are NaN and ``status`` is NO_BOUNDARY.
     """
 
     virtual_damping: float
@@ -181,7 +181,7 @@ class AdmittanceDisplay(Part):
             self.loop.make_system()
 
     def _rebuild(self) -> AdmittanceDisplay:
-        """Return a copy of the display with checks of all numbers, because JAX creates objects without these checks."""
+        """Return a copy of the display after a check of all its numbers, because JAX creates objects without checks."""
         timing = self.timing._rebuild()
         robot = self.robot._rebuild() if isinstance(self.robot, Actuator) else self.robot
         return AdmittanceDisplay(self.virtual_mass, self.virtual_damping, robot, timing, self.command, self.integrator)
@@ -278,7 +278,7 @@ class AdmittanceDisplay(Part):
         return self._label(EnvironmentLimit(K, frequency, status))
 
     def _find_limits(self, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> EnvironmentLimit:
-        """Return the largest stable K for arrays M, D and B of equal shape; the results are one-dimensional."""
+        """Return the largest stable K for each element of the equally shaped arrays M, D and B, in flattened arrays."""
         rows = np.stack([M, D, B], -1).reshape(-1, 3)
         is_valid = np.isfinite(rows).all(-1) & (rows[:, 0] > 0) & (rows[:, 1:] >= 0).all(-1)
         limits = find_limits(self.loop, *np.where(is_valid, rows.T, [[1.0], [0.0], [0.0]]))
@@ -428,7 +428,7 @@ class AdmittanceDisplay(Part):
     def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
         """Return the ends of the lowest stable interval of one gain (1/M, D, K or B), and a status.
 
-        The arguments are those of `_make_scene`.
+        ``gain`` is the name of this gain, and ``factors`` contains the values of the other gains (`_make_scene`).
         """
         intervals = self._make_scene(gain, factors).stable_stiffness(0.0)
         intervals = intervals[intervals[:, 1] > 0]
@@ -438,8 +438,8 @@ class AdmittanceDisplay(Part):
         return max(low, 0.0), high, int(Status.OK)
 
     def _find_frequency(self, gain: str, factors: dict[str, float], value: float) -> float:
-        """Return the frequency in Hz of the dominant pole if a gain has the given value.
+        """Return the frequency in Hz of the dominant pole if one gain (1/M, D, K or B) has the given value.
 
-        The arguments ``gain`` and ``factors`` are those of `_make_scene`.
+        ``gain`` is the name of this gain, and ``factors`` contains the values of the other gains (`_make_scene`).
         """
         return float(self._make_scene(gain, factors).dominant_pole(value, 0.0).frequency) if value == value else np.nan

@@ -99,7 +99,7 @@ class AdmittanceLoop:
         return LinearDevice((numerator, (*denominator, Fraction(0))))
 
     def make_system(self) -> System:
-        """Return robot and delay in units of the sampling period; raise `InputError` if they cannot be discretized."""
+        """Return robot and delay for time in sampling periods; raise `InputError` if they cannot be discretized."""
         system = System(self.plant, self.period, self.period**2, self.d, self.n_delay, Estimate())
         system.check()
         return system
@@ -124,12 +124,12 @@ class AdmittanceLoop:
             path = multiply(period, Z)
         if self.command == "velocity":
             return ProgramPolynomials(numerator, mass, damping)
-        # For position commands, multiply Y by path/zeta, the integrator from the virtual velocity to the position.
+        # If the command is a position, multiply Y by path/zeta, because the program integrates the virtual velocity.
         return ProgramPolynomials(multiply(numerator, path), multiply(mass, ZETA), multiply(damping, ZETA))
 
     @cached_property
     def sampled_robot(self) -> RobotPolynomials:
-        """Responses P and V from command to position and velocity of the robot (docs/theory/admittance.md, W2, W3)."""
+        """Responses P of the position and V of the velocity to the command (docs/theory/admittance.md, W2 and W3)."""
         system = self.make_system()
         if self.plant.dt:
             numerator, denominator = (to_zeta(part) for part in self.plant.system[:2])
@@ -141,12 +141,12 @@ class AdmittanceLoop:
         denominator = characteristic_polynomial(psi)
 
         def respond(output: np.ndarray) -> Polynomial:
-            """Return the numerator of the response of ``c X``, with the state X of the robot and the row c.
+            """Return the numerator of the response from the command to the signal ``c X``; X is the state of the robot.
 
-            ``output`` is c. The result is ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))``. Here Psi is the
-            transition matrix of X over one period minus the identity, and Gamma(t) is the state at the time t after a
-            unit command from rest. Both terms follow from ``c adj(A) g = det(A) - det(A - g c)`` (matrix determinant
-            lemma).
+            ``output`` is the row vector c. The numerator is ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))``. Here
+            Psi is the transition matrix of X over one period minus the identity, and Gamma(t) is the state at the time
+            t after a unit command from rest. The terms with Gamma(1 - f) and Gamma(1) are computed by the matrix
+            determinant lemma, ``c adj(A) g = det(A) - det(A - g c)``.
             """
             first, second = (
                 subtract(denominator, characteristic_polynomial(psi + np.outer(force, output)))
@@ -156,7 +156,8 @@ class AdmittanceLoop:
 
         sensor = _to_fractions(np.eye(len(B))[0])
         velocity = add(respond(_to_fractions(A[0])), multiply((Fraction(float(B[0])),), denominator))
-        # Set the constant coefficient to exactly 0, so that the zero of V at z = 1 cancels the pole of the integrator.
+        # V has a zero at z = 1, which cancels the pole of the integrator. Set the constant coefficient to exactly 0,
+        # because its rounding error would move this zero.
         velocity = trim((*(value / Fraction(self.period) for value in velocity[:-1]), Fraction(0)))
         return RobotPolynomials(respond(sensor), velocity, denominator, self.n_delay + 1)
 
@@ -171,7 +172,7 @@ class AdmittanceLoop:
 
 
 find_loop = lru_cache(KEPT_LOOPS)(AdmittanceLoop)
-"""Return the `AdmittanceLoop` with the given fields; the last loops are cached."""
+"""Return the `AdmittanceLoop` with the given fields, from a cache of the last loops."""
 
 
 def _to_fractions(values: Any) -> np.ndarray:

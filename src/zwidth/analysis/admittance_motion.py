@@ -37,7 +37,7 @@ class AdmittanceMotion(NamedTuple):
     position: np.ndarray  # position of the robot in m; 0 where the spring of the environment exerts no force
     velocity: np.ndarray  # velocity of the robot in m/s just before the sample; NaN for a discrete-time model
     force: np.ndarray  # measured contact force f_k in N
-    virtual_velocity: np.ndarray  # velocity of the virtual mass in m/s after the update of the program
+    virtual_velocity: np.ndarray  # velocity of the virtual mass in m/s, after the force f_k has changed it
     command: np.ndarray  # command that the program sends: position in m, or velocity in m/s
 
 
@@ -58,7 +58,7 @@ def simulate(
     Args:
         environment_stiffness: K in N/m, >= 0.
         environment_damping: B in N s/m, >= 0.
-        duration: duration in s, or a text such as "500 periods".
+        duration: duration in s, or a string such as "500 periods".
         force: force of the hand in N, a constant or an array with one value per sample.
 
     Returns:
@@ -94,7 +94,7 @@ def simulate(
 
 
 def _count_periods(duration: Any, period: float) -> int:
-    """Return the integer number of periods in a duration; raise `InputError` if it is not between 1 and the maximum."""
+    """Return the integer number of periods in a duration; raise `InputError` if it is not in [1, MAX_PERIODS]."""
     count = int(np.floor(check_span("duration", duration).periods(period) + 1e-9))
     if not 1 <= count <= MAX_PERIODS:
         raise InputError(f"duration: got {duration!r}, {count} periods; it must be 1 to {MAX_PERIODS} periods")

@@ -246,9 +246,9 @@ IMPROVEMENTS = {
     "coupling.stiffness": (2.0, "a link twice as stiff"),
     "tool.every": (0.5, "a physics engine twice as fast"),
 }
-# A heavier tool increases K_max of some scenes, a lighter tool that of others; `compute_gains` omits the other one.
+# A heavier tool increases K_max of some scenes, a lighter tool that of other scenes; only an increase is listed.
 TOOL_MASSES = ((2.0, "a tool twice as heavy"), (0.5, "a tool half as heavy"))
-HARMFUL_GAIN = 0.9995  # gain below which the note of an improvement contains "harmful"
+HARMFUL_GAIN = 0.9995  # ratio of the new K_max to the old one below which the note of a change contains "harmful"
 
 
 @compact_repr()
@@ -259,7 +259,7 @@ class Limit(NamedTuple):
     label: str  # the improvement in words, such as "half the delay"
     stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
     gain: float  # ratio of that stiffness to the current one
-    # A quantity that stays constant, such as "the delay stays 1 ms", and "harmful" if the stiffness decreases
+    # Note, such as "the delay stays 1 ms" for a quantity that stays constant, and "harmful" if K_max decreases
     note: str = ""
 
     def spell(self) -> str:
@@ -295,7 +295,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
     Returns:
         List of `Limit`, one per improvement, the largest gain first. Changes that reduce K_max are included, with a
         gain below 1 and the note "harmful", because a filter or a delay may also increase K_max. A filter given by its
-        coefficients is not changed and excludes other rates. NaN if K_max cannot be computed; these entries are last.
+        coefficients is not changed and excludes other rates. Entries without a computed K_max contain NaN and are last.
         The list is empty if K_max is infinite, which is possible for a virtual coupling.
 
     References:
@@ -341,7 +341,7 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     if least is not None:
         softest = with_unit(round_conservatively(least * scene.units.stiffness, "above"), system["N/m"])
         lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
-    for island in scene.islands() if scene.loop.has_boundary else []:
+    for island in scene.islands() if scene.loop.has_pieces else []:
         units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
         ends = (f"{name} from {' to '.join(format_interval(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(f"an island of stable walls, {', '.join(ends)}, is not connected to K = 0 and excluded from K_max")
@@ -417,7 +417,7 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
 def _double_rate(scene: SceneOptima) -> SceneOptima:
     """Return a copy of the scene with half the sampling period.
 
-    Filter, velocity window and tool steps stay constant in seconds, the delay in the unit in which it was given.
+    Filter, velocity window and steps of the tool stay constant in seconds, the delay in the unit in which it was given.
     """
     changes: dict[str, float] = {"period": scene.timing.period / 2}
     if scene.tool is not None and scene.tool.every > 1:

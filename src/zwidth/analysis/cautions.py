@@ -22,6 +22,8 @@ from zwidth.analysis.wall_search import (
 from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.grasps import list_grasps
+from zwidth.model.joint_space import JointDevice
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.formatting import format_wall, plain, with_unit
@@ -32,6 +34,10 @@ LEAST_PHASE_MARGIN = 10.0  # smallest phase margin, in degrees
 LEAST_GAIN_MARGIN = 1.3  # smallest gain margin, a factor on K and B together
 LEAST_DELAY_MARGIN = 0.1  # smallest delay margin, in sampling periods
 LONGEST_TIME_CONSTANT = 1.0  # largest time constant of the decay, in s
+SLOW_DECAY = "slow decay"  # first words of the text for a time constant that is too large
+# A slow motion is independent of the wall if half the stiffness changes its time constant by less than this ratio. The
+# time constant B/K of an overdamped wall would double.
+INDEPENDENT = 0.1
 
 
 def find_thin(verdict: Assessment, period: float) -> list[str]:
@@ -47,9 +53,33 @@ def find_thin(verdict: Assessment, period: float) -> list[str]:
         f"phase margin {plain(phase, 2)} deg": phase < LEAST_PHASE_MARGIN,
         f"gain margin {plain(gain, 3)}": gain > 0 and abs(math.log(gain)) < math.log(LEAST_GAIN_MARGIN),
         f"delay margin {with_unit(late, 's', 2)}": late < LEAST_DELAY_MARGIN * period,
-        f"time constant {with_unit(constant, 's', 2)}": constant > LONGEST_TIME_CONSTANT,
+        f"{SLOW_DECAY} (time constant {with_unit(constant, 's', 2)})": constant > LONGEST_TIME_CONSTANT,
     }
     return [words for words, short in thin.items() if short]
+
+
+def summarize_thin(thin: list[str]) -> str:
+    """Return "small margins", "slow decay" or both for the texts of `find_thin`; "" if there are none."""
+    slow = [SLOW_DECAY for text in thin if text.startswith(SLOW_DECAY)]
+    return ", ".join([*(["small margins"] if len(thin) > len(slow) else []), *slow])
+
+
+def explain_slow(scene: Any, verdict: Assessment, thin: list[str]) -> str:
+    """Return the cause and the remedy of a slow decay that the wall hardly affects; "" if there is another problem.
+
+    Args:
+        scene: scene with the wall.
+        verdict: assessment of the wall.
+        thin: texts of `find_thin`.
+    """
+    if summarize_thin(thin) != SLOW_DECAY or verdict.frequency != 0 or not isinstance(scene.device, LinearDevice):
+        return ""
+    softer = assess(scene.replace(stiffness=0.5 * scene.wall.stiffness))
+    if softer.frequency != 0 or not math.isclose(softer.time_constant, verdict.time_constant, rel_tol=INDEPENDENT):
+        return ""
+    if isinstance(scene.device, JointDevice):
+        return "a motion of the arm that hardly depends on the wall, such as sliding along it; more joint damping helps"
+    return "a motion of the device that hardly depends on the wall; more damping of the device helps"
 
 
 def list_cautions(recommendation: Any) -> tuple[str, ...]:
@@ -60,7 +90,10 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
         recommendation.requirements,
         [],
     )
-    if thin := find_thin(verdict, scene.timing.period):
+    thin = find_thin(verdict, scene.timing.period)
+    if cause := explain_slow(scene, verdict, thin):
+        cautions.append(f"{thin[0]}: {cause}")
+    elif thin:
         rings = thin[0].startswith("phase") and verdict.frequency > 0 and math.isfinite(verdict.time_constant)
         after = f": rings for {with_unit(verdict.time_constant, 's', 2)}" if rings else ""
         remedy = "more damping of the device or less delay"

@@ -49,7 +49,7 @@ class CouplingProgram(NamedTuple):
 
     members: list[str]  # declarations of the states, for C code
     start: list[str]  # statements that initialize the states at rest, with the tool at the position of the device
-    force: list[str]  # statements that compute f (the force on the device is -f), and integrate the tool
+    force: list[str]  # statements that compute the force f on the tool (-f acts on the device) and integrate the tool
 
 
 class DeviceCode(NamedTuple):
@@ -64,13 +64,14 @@ class DeviceCode(NamedTuple):
 class VelocityCode(NamedTuple):
     """Statements that estimate the velocity v of the device relative to the tool.
 
-    They estimate v from the distance e, or they subtract an estimate for the tool from that for the device.
+    The statements estimate v from the distance e, or subtract the estimated velocity of the tool from that of the
+    device.
     """
 
     members: list[str]  # declarations of the states in C
     start: list[str]  # statements that set the states to their values at rest
-    update: list[str]  # statements that compute the relative velocity v, and the states of the next sample
-    at_zero: list[str]  # statements that compute v for e = 0, and leave the states unchanged
+    update: list[str]  # statements that compute the relative velocity v and the states for the next sample
+    at_zero: list[str]  # statements that compute v for the distance e = 0, and leave the states unchanged
     direct: float  # direct feedthrough from e to v, in 1/s
 
 
@@ -158,7 +159,7 @@ def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityC
     advance = [f"@{prefix}next = (@{prefix}next + 1) % {count}"] if count > 1 else []
 
     def estimate_from(name: str, statements: list[str]) -> list[str]:
-        """Return statements that estimate the velocity; the variable ``name`` contains the newest position."""
+        """Return statements that estimate a velocity; the variable called ``name`` contains the newest position."""
         difference = f"{name} - {past}" if count else name
         entering = f"u = ({difference}) / {count}" if count > 1 else f"u = {difference}"
         scale = f"{value} = {code.gain / period!r} * u"
@@ -182,7 +183,7 @@ def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityC
 
 
 def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityCode) -> tuple[list[str], list[str]]:
-    """Return two lists of statements: the first computes the distance e, the second integrates the tool.
+    """Return two lists of statements: the first computes the distance e of device and tool, the second moves the tool.
 
     Args:
         scene: the scene with the wall.
@@ -208,7 +209,7 @@ def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityC
     share = 1.0 / (1.0 + damping * rate + stiffness * rate * length)
     lever = rate * length * share
     rest = "v" if position == "x" and scene.feedback is None else "v_rest"
-    # Compute v_free and e in every period, so that both are defined also in periods without a step of the tool.
+    # Define e and v_free, the velocity of the tool for f = 0, also in periods without a step of the tool.
     solve = [f"e = {position} - @tool_position"] * (every > 1) + [
         "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
         f"v_free = {_join((share, '@tool_velocity'), (-share * rate * stiffness, '@tool_position'))}",

@@ -29,7 +29,7 @@ from zwidth.stability.linear.coupled_controller import find_coupling_delay_margi
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.ridge import RidgeSolution
 from zwidth.stability.linear.roots import LoopRoots
-from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
+from zwidth.stability.linear.rows import CONNECTED_START, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
 from zwidth.units.quantities import WALL_RANGE
 
@@ -62,7 +62,8 @@ class CouplingLoop(LinearLoop):
     def stable_ratios(self) -> np.ndarray:
         """Intervals of the ratio alpha/beta, shape (n, 2), in which all sufficiently stiff couplings are stable.
 
-        The array is empty if no coupling is stable in the limit of large beta, or if `has_free_stiffness` is True.
+        The array is empty if no coupling is stable in the limit of large beta. The array is also empty if
+        `has_free_stiffness` is True; then every ratio is stable.
         """
         loop = self.roots
         if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:
@@ -81,7 +82,7 @@ class CouplingLoop(LinearLoop):
     def free_damping(self) -> float:
         """The smallest beta in `TESTED_DAMPINGS` with which the coupling is stable for every alpha > 0; NaN if none is.
 
-        The value is also NaN if `has_free_stiffness` is False.
+        The value is also NaN if not all couplings with sufficiently large alpha are stable (`has_free_stiffness`).
         """
         if not self.has_free_stiffness:
             return np.nan
@@ -106,7 +107,7 @@ class CouplingLoop(LinearLoop):
             return super().stiffest(negative)
         low, high = self.stable_ratios.T
         if ((low <= 0) & (high > 0)).any():
-            # Every alpha > 0 is stable with a sufficiently large beta.
+            # The stiffness is unlimited, because every alpha > 0 is stable with a sufficiently large beta.
             unlimited, nan = np.float64(np.inf), np.float64(np.nan)
             return RidgePoint(unlimited, unlimited, nan, np.int32(RidgeKind.NONE), np.int32(Status.OK))
         beta = np.float64(self.free_damping)
@@ -117,8 +118,8 @@ class CouplingLoop(LinearLoop):
     def is_connected(self, alpha: float, beta: float) -> bool:
         if not self.unbounded:
             return super().is_connected(alpha, beta)
-        # All stable couplings with very large alpha are connected to each other.
-        # They are connected to alpha = 0 if one beta is stable for every alpha > 0.
+        # All stable couplings with very large alpha belong to one region of the plane of alpha and beta.
+        # This region is connected to alpha = 0 if one beta is stable for every alpha > 0.
         intervals = find_stable_intervals(self.boundary, np.array([beta]))
         inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
         from_zero = intervals.low[0] <= CONNECTED_START * alpha
@@ -129,8 +130,17 @@ class CouplingLoop(LinearLoop):
             raise InputError("tool: the coupling is stable with every larger damping; choose B by spectral_radius")
         return super().find_connected_beta(alpha, least)
 
-    def islands(self, least: float) -> list[Island]:
-        return [] if self.unbounded else super().islands(least)
+    @property
+    def has_pieces(self) -> bool:
+        return not self.unbounded
+
+    def explain_limit(self) -> str:
+        if not self.unbounded:
+            return ""
+        return (
+            "stable couplings exist for arbitrarily large K, but no tested B is stable for every K > 0; choose K and B "
+            "by is_stable or stable_stiffness"
+        )
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         others = [name for name in Margins._fields if name in wanted and name != "delay_margin"]

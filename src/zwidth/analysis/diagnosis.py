@@ -168,8 +168,8 @@ def diagnose(
     First `zwidth.Scene.is_stable` decides the stability of the linear loop. Then the wall is simulated with encoder,
     friction and motor from several initial displacements, each without external force and with the worst constant one,
     K times half an encoder step. If removing the motor limits more than halves the amplitude, the cause is saturation;
-    otherwise it is quantization. The same simulations confirm each remedy of a limit cycle at many values from the
-    returned one to 64 times the change. The ranges of an unstable linear loop are exact.
+    otherwise it is quantization. To confirm a remedy of a limit cycle, the simulations are repeated at many values
+    of its parameter, from the returned value to 64 times the change. The ranges of an unstable linear loop are exact.
 
     Args:
         scene: device, timing and parts.

@@ -32,7 +32,7 @@ NYQUIST_TOLERANCE = 1e-12  # relative distance of the angle w from pi below whic
 
 
 def find_environment_limits(display: Any, points: np.ndarray, order: int) -> list[np.ndarray]:
-    """Return limit K, frequency and status, with derivatives with respect to the numbers of the display and M, D, B.
+    """Return the largest stable stiffness K, its frequency in Hz and a status, with derivatives.
 
     Args:
         display: a display, whose own virtual mass and damping have no effect.
@@ -40,8 +40,8 @@ def find_environment_limits(display: Any, points: np.ndarray, order: int) -> lis
         order: order of the highest derivative, 0, 1 or 2.
 
     Returns:
-        Values (K, frequency, status) of shape (points, 3). Derivatives have one or two further axes for the variables:
-        the numbers of the display, then M, D and B.
+        Values (K, frequency, status) of shape (points, 3), and their derivatives up to the given order. Derivatives
+        have one or two further axes for the variables: the numbers of the display, then M, D and B.
     """
     M, D, B = points.T
     limit = display.max_environment_stiffness(B, virtual_mass=M, virtual_damping=D)
@@ -63,11 +63,12 @@ def find_environment_limits(display: Any, points: np.ndarray, order: int) -> lis
 
 
 def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float], list[Taylor]]:
-    """Return a function of the list [M, D, B], K and w, which returns K and its frequency in Hz, with derivatives.
+    """Return a function that computes the derivatives of the largest stable K and of its frequency in Hz.
 
-    At an integer delay, K of some robots has a kink as a function of the delay. The derivative with respect to the
-    delay is then right-sided; if the delay is given in seconds, so is the derivative with respect to the period. A
-    robot model in discrete time is valid for one period and one delay only, so its derivatives in both are NaN.
+    The arguments of this function are the list [M, D, B], K, and the angle w of the pole on the unit circle. At an
+    integer delay, K of some robots has a kink as a function of the delay. The derivative with respect to the delay is
+    then right-sided. If the delay is given in seconds, the derivative with respect to the period is right-sided, too. A
+    robot model in discrete time is valid for one period and one delay only, so these two derivatives are NaN.
     """
     loop, count = display.loop, len(list_leaves(display))
     n = loop.n_delay
@@ -92,7 +93,7 @@ class LimitTerms:
     """Taylor expansions of the discretized robot in all variables: the numbers of the display, M, D, B, K and w."""
 
     def __init__(self, display: Any, order: int, n: int) -> None:
-        """Discretize the robot; ``order`` is 1 or 2, and ``n`` the integer part of the delay in periods."""
+        """Discretize the robot. The highest derivative has the ``order`` 1 or 2; the integer delay is ``n`` periods."""
         self.loop, self.n = display.loop, n
         leaves = list_leaves(display)
         # Set the last five variables (M, D, B, K, w) to 1, because the robot does not depend on their values.
@@ -102,18 +103,21 @@ class LimitTerms:
         timing = self.varied.timing
         self.period = timing.period
         d = timing._periods if timing.in_periods else timing.delay / timing.period
-        # Use the delay in periods of the loop, because delay/period has a rounding error, which `Timing.d` removes.
+        # Use the value `loop.d` of the delay in periods, because delay/period has a rounding error.
         fraction = Taylor(np.float64(self.loop.d), d.first, d.second) - n
         self.A, self.b = self._realize()
         self.states = StateTerms(self.A, self.b, self.one, fraction, bool(self.loop.plant.dt))
 
     def differentiate(self, factors: list[float], K: float, w: float) -> list[Taylor]:
-        """Return the limit K and its frequency in Hz, with derivatives in the numbers of the display and M, D, B.
+        """Return the largest stable K and its frequency in Hz, with derivatives.
 
         Args:
             factors: values of M, D and B.
             K: the limit in N/m.
             w: angle of the pole on the unit circle.
+
+        Returns:
+            K and the frequency; the variables of their derivatives are the numbers of the display, M, D and B.
         """
         values = [*factors, K, w]
         M, D, B, stiffness, angle = (
@@ -137,7 +141,7 @@ class LimitTerms:
         M, D, B, K = factors
         z, zeta, T = lam.exp(), lam.expm1(), self.period
         # The semi-implicit method computes the virtual velocity v = T z/(M zeta + T D) f from the force f.
-        # The trapezoidal method has the same response with T multiplied by ``half``, and M zeta by z (W1).
+        # The trapezoidal method has the same response with T ``half`` in place of T, and M zeta z in place of M zeta.
         half, mass, path = self.one, zeta, z
         if self.loop.integrator == "trapezoidal":
             half = (z + 1.0) * 0.5
@@ -149,7 +153,7 @@ class LimitTerms:
         return inverse + (K * position + B * velocity) * (lam * -(self.n + 1)).exp()
 
     def _respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
-        """Return the responses ``X_1`` (position) and ``(A_1 X + b_1)/T`` (velocity) of the robot, without delay."""
+        """Return P and V without the factor z^-(n+1): the responses ``X_1`` and ``(A_1 X + b_1)/T`` to the command."""
         state = self.states.respond(zeta)[1]
         velocity = self.b[0]
         for k in range(len(self.b.v)):
@@ -161,7 +165,7 @@ class LimitTerms:
         T, robot, loop = self.period, self.varied.robot, self.loop
         if not isinstance(robot, Actuator):
             A, b = (stack(part, self.one) for part in loop.make_system().realize()[:2])
-            # Both matrices of a robot in continuous time are proportional to the sampling period T.
+            # For time in periods, both matrices of a robot in continuous time are proportional to the period T.
             factor = self.one if loop.plant.dt else T / loop.period
             return tuple(
                 part * factor.map(lambda v, part=part: np.asarray(v)[(None,) * part.v.ndim]) for part in (A, b)

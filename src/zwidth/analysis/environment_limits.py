@@ -39,8 +39,8 @@ NEAR_REAL = 1e-3
 CLEARANCE = 1e-6
 LARGEST_DEGREE = 30  # largest degree of a characteristic polynomial whose roots are computed as eigenvalues
 NEGLIGIBLE = 1e-18  # coefficients of a Chebyshev series below this, relative to the largest one, are rounding errors
-TESTED = (1 / 16, 1 / 2, 15 / 16)  # tested fractions of the limit: stable at all three, or unstable at all three
-# Angles w in rad per period at which `_confirm_angles` evaluates the Chebyshev series
+TESTED = (1 / 16, 1 / 2, 15 / 16)  # tested fractions of the computed limit; stability must be the same at all three
+# Angles w in rad per period at which the sign of Im K is tested, to find missing crossings (`_confirm_angles`)
 NODES = np.concatenate([np.geomspace(1e-6, 0.3, 120), np.linspace(0.3, np.pi - 1e-6, 121)[1:]])
 
 
@@ -68,7 +68,7 @@ def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarra
 
 @lru_cache(KEPT_LOOPS)
 def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients that are independent of M, D and B, as two matrices with one row per polynomial.
+    """Return two matrices of polynomial coefficients that do not depend on M, D and B, with one row per polynomial.
 
     The rows of the first matrix are the Chebyshev coefficients of ``Im(p(z) p_K(1/z))/sin w`` for p = p_M, p_D and p_B.
     Those of the second matrix are the coefficients of p_M, p_D, p_B and p_K in powers of zeta = z - 1.
@@ -80,7 +80,7 @@ def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarray, factors: np.ndarray) -> Limits:
-    """Return the limits of one block of displays: ``factors`` has one row (M, D, B) per display."""
+    """Return the largest stable K of each display of a block; ``factors`` has one row (M, D, B) per display."""
     coefficients = factors @ series
     with np.errstate(all="ignore"):
         angles, is_ambiguous = _find_angles(coefficients)
@@ -101,10 +101,11 @@ def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarra
 
 
 def _confirm_angles(coefficients: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Return True for each display whose crossings agree with the signs of the Chebyshev series at the nodes.
+    """Return True for each display whose computed angles agree with the sign of the Chebyshev series at `NODES`.
 
-    Between neighboring nodes, the number of crossings must be odd if and only if the sign changes. The check is needed,
-    because eigenvalues may miss crossings if the coefficients of the series differ by many orders of magnitude.
+    Between two neighboring nodes, the number of angles at which the series is 0 must be odd if and only if its sign
+    changes. The check is needed, because the eigenvalue solver may miss such angles if the coefficients of the series
+    differ by many orders of magnitude.
     """
     # Evaluate the series times sin w, which is a sum of sin((k + 1) w); sin w > 0 does not change the sign.
     values = coefficients @ np.sin(np.outer(np.arange(1, coefficients.shape[1] + 1), NODES))
@@ -114,7 +115,7 @@ def _confirm_angles(coefficients: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def _expand_crossings(p: Polynomial, p_K: Polynomial) -> np.ndarray:
-    """Return the coefficients of the Chebyshev polynomials U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``."""
+    """Return the coefficients of the Chebyshev polynomials U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``, z = e^(jw)."""
     ascending, other = p[::-1], p_K[::-1]
     size = max(len(ascending), len(other), 1)
     sums = [Fraction(0)] * size
@@ -133,7 +134,7 @@ def _stack(rows: list[np.ndarray], *, at_end: bool) -> np.ndarray:
 
 
 def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the angles w of the crossings of each display, padded with NaN, and True if their number is unclear.
+    """Return the angles w at which K is real, per display and padded with NaN, and True if their number is unclear.
 
     Args:
         series: coefficients of the Chebyshev polynomials U_0, U_1, ..., one row per display.
@@ -145,7 +146,7 @@ def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     count, top = series.shape[1] - 1, series[:, -1:]
     is_invalid = (top[:, 0] == 0) | ~np.isfinite(series).all(-1)
     # Build the colleague matrix, whose eigenvalues are the roots x, from x U_k = (U_(k+1) + U_(k-1))/2 in row k.
-    # In the last row, use the series to eliminate U_(k+1).
+    # In the last row, eliminate U_(k+1) by setting the Chebyshev series to 0.
     matrix = np.zeros((len(series), count, count))
     matrix += (np.eye(count, k=1) + np.eye(count, k=-1)) / 2.0
     if count:
@@ -158,7 +159,7 @@ def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _evaluate(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> Any:
-    """Return the complex stiffness ``K = M u_M + D u_D + B u_B`` with which a pole is at e^(jw), for angles w.
+    """Return the stiffness K of the environment, in general complex, with which a pole is at e^(jw), for angles w.
 
     ``factors`` has a row (M, D, B) per row of ``angles``.
     """
@@ -175,7 +176,7 @@ def _evaluate(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> 
 
 
 def _refine(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Refine the angles of crossings by Newton's method, so that the imaginary part of K becomes 0."""
+    """Refine the angles at which K is real by Newton's method, so that the imaginary part of K becomes 0."""
     for _ in range(NEWTON_STEPS):
         low, high = angles * (1.0 - STEP), angles * (1.0 + STEP)
         slope = (_evaluate(loop, factors, high) - _evaluate(loop, factors, low)).imag / (high - low)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,16 +23,38 @@ SPLITS = 33  # frequencies per bracket in each refinement
 REFINEMENTS = 9  # number of refinements; each divides the width of a bracket by 32
 
 
-def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, float]:
-    """Return the ends of the interval of stable values of one gain, with all other gains of the controller unchanged.
+def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, float] | None:
+    """Return the ends of an interval of stable values of one gain, with all other gains of the controller unchanged.
 
     Args:
         make: function that returns the `zwidth.Scene` of the controller for a value of this gain.
-        gain: a stable value of the gain, > 0, which the interval contains.
+        gain: the given value of the gain, not 0.
 
     Returns:
-        Lower end, at least 0, and upper end; infinity if every larger gain is stable.
+        Lower end, at least 0, and upper end, which is infinity if every larger gain is stable. If the given value is
+        unstable or negative, the interval is the stable one closest to this value; None if no positive value is stable.
     """
+    size = abs(gain)
+    critical = size * _find_critical(make, size)
+    if gain > 0 and bool(make(gain).is_stable()):
+        below, above = critical[critical <= gain], critical[critical > gain]
+        return float(below.max(initial=0.0)), float(above.min(initial=math.inf))
+    ends = [0.0, *critical.tolist(), math.inf]
+    intervals = list[tuple[float, float]]()
+    for low, high in pairwise(ends):
+        # Skip intervals between critical values that differ only by rounding errors.
+        if math.isfinite(high) and high - low <= 1e-9 * high:
+            continue
+        inside = 0.5 * (low + high) if math.isfinite(high) else 2.0 * (low or size)
+        if bool(make(inside).is_stable()):
+            # Join adjacent intervals, because poles may touch the unit circle without crossing it.
+            joined = bool(intervals) and intervals[-1][1] == low
+            intervals[-1:] = [(intervals[-1][0], high)] if joined else [*intervals[-1:], (low, high)]
+    return min(intervals, key=lambda ends: max(ends[0] - gain, gain - ends[1]), default=None)
+
+
+def _find_critical(make: Callable[[float], Any], gain: float) -> np.ndarray:
+    """Return the positive critical values of one gain relative to ``gain``, a positive value, in ascending order."""
     without, given = make(0.0), make(gain)
     nyquist = 0.5 / float(given.timing.period)
 
@@ -55,9 +78,7 @@ def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, 
     roots = [evaluate(0.5 * (low + high)).real] if index.size else []
     critical = np.concatenate([*roots, values[-1:].real])
     # Exclude sign changes of Im x at poles of x, where |x| is infinite.
-    critical = critical[np.isfinite(critical) & (critical > 0) & (critical < 1e9)]
-    below, above = critical[critical <= 1.0], critical[critical > 1.0]
-    return gain * float(below.max(initial=0.0)), gain * float(above.min(initial=math.inf))
+    return np.sort(critical[np.isfinite(critical) & (critical > 0) & (critical < 1e9)])
 
 
 def _open_loop(scene: SceneParts, frequency: np.ndarray) -> np.ndarray:

@@ -84,16 +84,20 @@ class LinearLoop:
     # Cache of computed ridges; the key is True if negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Default number of random devices in tolerance estimates. It is small, because K_max of one device takes 10 to 50
-    # ms.
+    # Default number of random devices in tolerance estimates; small, because K_max of a device takes 10 to 50 ms.
     draws: ClassVar[int] = 200
     # True if the methods with arguments alpha and beta work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
     # Largest velocity window and delay, in periods, that searches in other modules try. It is limited, because the run
     # time increases with the square of window and delay.
     most_periods: ClassVar[float] = 128
-    # True if the stability boundary in the plane of alpha and beta is available, from which margins and islands follow.
+    # True if the stability boundary in the plane of alpha and beta is available, from which margins follow.
     has_boundary: ClassVar[bool] = True
+
+    @property
+    def has_pieces(self) -> bool:
+        """True if the connected pieces of the stable set are available, so that `islands` and `outlines` work."""
+        return self.has_boundary
 
     @cached_property
     def chain(self) -> AnyChain:
@@ -227,7 +231,7 @@ class LinearLoop:
         return []
 
     def explain_limit(self) -> str:
-        """Return the reason why the stiffest wall is undecided: "", because a model decides every wall."""
+        """Return the reason why the stiffest wall is not computed; "" if the message of its status suffices."""
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
@@ -298,7 +302,7 @@ class LinearLoop:
         return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def with_delay(self, delay: float) -> LoopRoots:
-        """Return the poles and zeros of the loop without a wall, with ``delay`` (in periods) in place of its delay."""
+        """Return the poles and zeros of the loop without a wall, for another delay, in periods."""
         return change_delay(self.chain, delay)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:

@@ -51,8 +51,11 @@ class StiffestWall(NamedTuple):
 def explain_missing(scene: SceneAnalysis, status: Any) -> str:
     """Return a text with the reason why a scene has no stiffest wall, from the status code of the search."""
     if status == Status.NO_BOUNDARY:
-        return "no stiffness is stable at any damping"
-    explained = scene.loop.explain_limit() if status == Status.UNDECIDED else ""
+        allowed = "" if allows_negative(scene, None) else " with B >= 0"
+        if scene.loop.has_pieces and scene.islands():
+            return f"no stable wall{allowed} is connected to K = 0; the stable walls are on islands"
+        return f"no stiffness is stable at any damping{allowed}"
+    explained = scene.loop.explain_limit() if status in (Status.UNDECIDED, Status.NOT_CONVERGED) else ""
     return explained or Status(int(status)).message
 
 
@@ -409,8 +412,7 @@ class SceneOptima(SceneAnalysis):
 
         Numerics:
             Samples in the stable intervals of B, then golden-section search around the three lowest minima, because the
-            optimum is usually a kink at which poles meet. The spectral radius is accurate to about 1e-8 if two poles
-            meet. Run time 0.1 to 1 s.
+            optimum is usually a kink at which poles meet; the radius then has an error of 1e-7. Run time 0.1 to 1 s.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section VIII. Landau 1990 (modulus margin).

@@ -185,7 +185,7 @@ class Recommendation:
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c", *, max_force: float | str = math.inf) -> str:
-        """Return the wall, or the coupling and its tool, with the velocity estimate as source code for a control loop.
+        """Return source code for a control loop, which renders the wall, or the virtual coupling and its tool.
 
         Args:
             language: "c" (C99 without any library) or "python".
@@ -195,7 +195,7 @@ class Recommendation:
             Source code with a state, a function that initializes it at rest, and a function to call once per period,
             which converts the position in m, positive into the wall, to the force on the device in N. The forces equal
             those of `zwidth.simulate` with ``contact="unilateral"`` and the same ``max_force``, except for rounding
-            errors. If the scene has a tool, the program also integrates the tool, and the forces equal those of
+            errors. If the scene has a tool, the program also integrates the tool, and its forces equal those of
             `zwidth.simulate` with ``contact="bilateral"``.
 
         Raises:
@@ -207,10 +207,11 @@ class Recommendation:
         return write_program(self.scene, language, self.cautions, limit)
 
     def cascade_gains(self, units: PositionUnit | None = None, output_unit: float = 1.0) -> CascadeGains:
-        """Return the gains of a position loop with an inner velocity loop, such as those of ODrive, for the wall.
+        """Return the gains with which a cascade, a position loop with an inner velocity loop, renders the wall.
 
-        The gain of the integrator is that of the scene. The wall is stable and satisfies the requirements with these
-        gains, because the integrator of the field ``scene`` contains ``pos_gain`` = K/B of the recommended wall.
+        Such a cascade is, for example, the controller of ODrive. The gain of its integrator is that of the scene. The
+        wall is stable and satisfies the requirements with these gains, because the integrator of the field ``scene``
+        contains ``pos_gain`` = K/B of the recommended wall.
 
         Args:
             units: position unit of the gains: "turns", "degrees", "rad" or "m". Default: turns, or m for a linear
@@ -386,9 +387,9 @@ class SceneAdvice(SceneOptima):
         """Return the wall recommended for this device: the stiffest that satisfies the requirements.
 
         Args:
-            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1, or a text such as "50%".
-            gain_margin: smallest gain margin, a factor on K and B together, > 1, or a text such as "6 dB".
-            phase_margin: smallest phase margin in degrees, > 0, or a text such as "30 deg".
+            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1, or a string such as "50%".
+            gain_margin: smallest gain margin, a factor on K and B together, > 1, or a string such as "6 dB".
+            phase_margin: smallest phase margin in degrees, > 0, or a string such as "30 deg".
             passive: require a passive wall.
             grasps: require stability in "all" or only the "soft" grasps of `zwidth.reference_grasps`, or in "none".
             beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its K is at most

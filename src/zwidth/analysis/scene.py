@@ -6,26 +6,29 @@ The parts are checked in `zwidth.analysis.base`; the analyses are in `zwidth.ana
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth.analysis.base import WallSI, wrap_methods
 from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
+from zwidth.analysis.coupling_code import write_program
 from zwidth.analysis.lightest_tool import lightest_tool
 from zwidth.analysis.recommendation import SceneAdvice
 from zwidth.analysis.unsafe_world import unsafe_world
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
 from zwidth.core.xp import is_traced, namespace
-from zwidth.model.checks import read_texts
+from zwidth.model.checks import check_limit, read_texts
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.numerics.evaluate import as_float64
 from zwidth.simulation.simulate import simulate
 from zwidth.stability.linear.regions import Outline
 from zwidth.units.display import ResultList
+from zwidth.units.formatting import format_wall
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,6 +106,48 @@ class Scene(SceneAdvice):
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
             for piece in self.loop.outlines()
         )
+
+    def code(
+        self,
+        stiffness: float | str | None = None,
+        virtual_damping: float | str | None = None,
+        language: Literal["c", "python"] = "c",
+        *,
+        max_force: float | str = math.inf,
+    ) -> str:
+        """Return a stable wall, or a coupling and its tool, as source code for a control loop.
+
+        `Recommendation.code` returns the same code for the recommended wall, whose margins are known. This method
+        accepts every stable wall, also one with small margins.
+
+        Args:
+            stiffness: K of the wall in N/m. Default: that of the scene.
+            virtual_damping: B of the wall in N s/m. Default: that of the scene.
+            language: "c" (C99 without any library) or "python".
+            max_force: largest force of the motor in N; the code limits the force to it.
+
+        Returns:
+            Source code with a state, a function that initializes it at rest, and a function to call once per period.
+
+        Raises:
+            InputError: the wall is unstable, the scene has no wall, the language is unknown, or ``max_force`` is not
+                positive.
+
+        Example:
+            >>> import zwidth
+            >>> device, timing = zwidth.Device(mass="100 g", damping=10), zwidth.Timing(rate="1 kHz")
+            >>> scene = zwidth.Scene(device, timing, tool=zwidth.Tool("300 g", every=8))
+            >>> print(scene.code("1.4 kN/m", 0).splitlines()[1].strip())
+            Tool: mass 300.0 g, semi-implicit Euler method, one step every 8 periods.
+        """
+        wall = {"stiffness": stiffness, "virtual_damping": virtual_damping}
+        changes = {name: value for name, value in wall.items() if value is not None}
+        scene = self.replace(**changes) if changes else self
+        if not scene.is_stable():
+            K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+            words = format_wall(K, B, scene.unit_system)
+            raise InputError(f"code: the wall {words} is not stable; choose a stable wall by recommend or check")
+        return write_program(scene, language, (), check_limit("max_force", max_force, scene.unit_system["N"]))
 
     is_safe_for_every_world = is_safe_for_every_world
     lightest_tool = lightest_tool

@@ -34,13 +34,14 @@ from zwidth.units.quantities import WALL_RANGE
 
 # Grids of alpha and beta. Their *scales* are alpha and beta of the stiffest wall of the device without a tool.
 LOWEST, HIGHEST = 1e-7, 1e3  # ends of the range of alpha and beta, relative to their scales
-LIGHT_TOOL = 1e-4  # lower end of both ranges for a light tool of mass M, relative to M/(m N^2) (see `_grids`)
+# Lower end of both ranges for a light tool of mass M, relative to M/(m N^2) with the mass m of the device
+LIGHT_TOOL = 1e-4
 PER_DECADE_ON_LINE = 24  # points per decade on a line of constant alpha or beta
-INSERTED = 12  # points inserted at each extremum of the spectral radius that may hide two crossings of 1
+INSERTED = 12  # points inserted at each extremum of the spectral radius near 1, which may hide two crossings of 1
 INSERTIONS = 2  # largest number of passes that insert such points
 PER_DECADE = 8  # points per decade of the first grid in the plane of alpha and beta
-FINE_DECADES, FINE_PER_DECADE = 2, 32  # decades below the largest stable alpha with a fine grid; points per decade
-POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # values of beta on the fine grid: number per N, and its limits
+FINE_DECADES, FINE_PER_DECADE = 2, 32  # decades of the fine grid, below the largest stable alpha; points per decade
+POINTS_PER_PERIOD, MIN_POINTS, MAX_POINTS = 12, 96, 256  # 12 N values of beta on the fine grid, from 96 to 256
 SUMMITS = 3  # number of local maxima of the fine grid, the highest ones, that are refined
 
 # Refinement of a local maximum of alpha in a window of alpha and beta
@@ -67,8 +68,8 @@ class SlowToolLoop(LinearLoop):
     def roots(self) -> LoopRoots:
         """Poles and zeros of the loop without a wall; access raises `InputError`, because a periodic loop has none."""
         raise InputError(
-            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; with larger "
-            "values, only stability, spectral radius, poles, stable intervals and maximum stiffness are available"
+            f"tool.every: got {self.scene.tool.every}, but this result is available only for every = 1; for a slow "
+            "tool, choose K and B by the spectral radius and the stable intervals, which zwidth check prints"
         )
 
     @cached_property
@@ -128,7 +129,7 @@ class SlowToolLoop(LinearLoop):
 
     @cached_property
     def _grids(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Smallest and largest positive alpha, and smallest and largest positive beta, on the grids of searches."""
+        """Smallest and largest positive alpha, and smallest and largest positive beta, of the search grids."""
         wall = LinearLoop(self.scene.replace(tool=None)).stiffest(False)
         alpha = float(wall.alpha) if wall.status == Status.OK and wall.alpha > 0 else 1.0
         beta = max(alpha, float(wall.beta)) if np.isfinite(wall.beta) else alpha
@@ -186,10 +187,11 @@ class SlowToolLoop(LinearLoop):
         return RidgePoint(np.float64(alpha), np.float64(beta), omega, np.int32(kind), np.int32(Status.OK))
 
     def _find_summits(self) -> list[tuple[float, float, float, float]] | None:
-        """Return arguments of `_climb` for the highest local maxima of the largest stable alpha, a function of beta.
+        """Return the highest local maxima of the largest stable alpha as a function of beta, found on a grid.
 
-        A stable alpha counts only if stable grid points connect it to the softest stable couplings. The list is empty
-        if no coupling is stable. The result is None if the stable couplings reach the largest alpha of the grid.
+        Each maximum is a tuple (alpha, beta, height, width), the arguments of `_climb`. A stable alpha counts only if
+        stable grid points connect it to the softest stable couplings. The list is empty if no coupling is stable. The
+        result is None if the stable couplings reach the largest alpha of the grid.
         """
         from scipy.ndimage import label
 
@@ -220,9 +222,10 @@ class SlowToolLoop(LinearLoop):
         ]
 
     def _refine_tops(self, alpha: Array, beta: Array, logs: Array, counted: Array) -> Array:
-        """Return, for each beta, the upper end of the stable interval that contains the largest counted alpha.
+        """Return, for each beta, the largest stable alpha, refined between the points of a grid.
 
-        The result is 0 for a beta without a counted alpha.
+        This alpha is the upper end of the stable interval that contains the largest counted grid point. The result is 0
+        for a beta without a counted grid point.
 
         Args:
             alpha: rows of a grid.

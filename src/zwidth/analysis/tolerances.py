@@ -34,7 +34,7 @@ class Tolerance(NamedTuple):
     distribution has a standard deviation of ``share`` times the nominal value.
     """
 
-    share: float | str  # relative tolerance, a number or a text such as "5%"
+    share: float | str  # relative tolerance, a number or a string such as "5%"
     distribution: Literal["uniform", "normal"] = "uniform"
 
 

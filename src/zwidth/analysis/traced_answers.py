@@ -46,7 +46,7 @@ def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float =
 
 
 def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], unknowns: Sequence[Taylor]) -> None:
-    """Store the derivatives of each unknown in its row, from ``rows``, of the results for one point."""
+    """Store the derivatives of each unknown in the results for one point; ``rows`` has one row index per unknown."""
     for row, unknown in zip(rows, unknowns, strict=False):
         for result, part in zip(results[1:], (unknown.first, unknown.second), strict=False):
             result[point, row] = part
@@ -304,7 +304,7 @@ def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *o
 def _differentiate_required(
     scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
 ) -> Taylor:
-    """Return the parameter value for a required stiffness, with derivatives in the scene and in this stiffness."""
+    """Return the parameter value for a required stiffness, with derivatives in the scene and the stiffness."""
     path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
     changed = scene.replace(**{path: x})
     count, index = len(list_leaves(scene)), index_parameters(changed)[path]

@@ -123,7 +123,7 @@ class TracedLoop(LinearLoop):
         )
 
     def _forbid_derivatives(self, value: Array) -> Array:
-        """Return the value unchanged; its derivatives by JAX raise `InputError` if the tool has ``every`` > 1.
+        """Return the value unchanged; if the tool has ``every`` > 1, its differentiation by JAX raises `InputError`.
 
         Derivatives are computed from the stability boundary, which is not available if the tool makes one step per
         several periods.

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 NODES = 800  # number of frequencies at which the condition of `is_safe_for_every_world` is evaluated
 LOWEST = 1e-4  # lowest tested frequency, in rad per period
-MAX_FREQUENCIES = 24  # largest number of frequencies, at which the condition is violated, with tested worlds
+MAX_FREQUENCIES = 24  # largest number of frequencies that violate the condition and for which worlds are tested
 MAX_MASSES = 6  # number of masses of the hand that are tested per frequency
 HEAVIEST = 1e4  # ratio of the largest to the smallest tested mass of the hand
 LEAST_GROWTH = 1e-13  # smallest logarithm of the spectral radius that counts as unstable, above rounding errors
@@ -74,7 +74,7 @@ class _World(NamedTuple):
 def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = None) -> UnsafeWorld:
     """Return a passive tool and a passive hand with which a virtual coupling is unstable.
 
-    They exist if the coupling violates the condition of `is_safe_for_every_world`. The tool is a mass M with a spring k
+    Both exist if the coupling violates the condition of `is_safe_for_every_world`. The tool is a mass M with a spring k
     to ground. Its program integrates by the trapezoidal rule, so the tool is lossless: from the force f of the
     coupling, the velocity v, the force s of the spring and the position y, it computes the new values
     ``v' = v + T/(2M) (f' - s' + f - s)``, ``s' = s + k T/2 (v' + v)`` and ``y' = y + T v'``. The hand is a mass and a
@@ -140,7 +140,8 @@ def _report_none(status: Status) -> UnsafeWorld:
 def _search(alpha: float, beta: float, delta: float, n_delay: int) -> tuple[_World, float, float] | None:
     """Return the world with the largest spectral radius, the logarithm of this radius, and the angle of its pole.
 
-    The result is None if no world has a radius above 1 that a pole count confirms.
+    The result is None if no world has a spectral radius above 1, or if pole counts confirm none of these worlds as
+    unstable.
     """
     results = []
     for world in _list_worlds(alpha, beta, delta, n_delay):
@@ -156,7 +157,7 @@ def _search(alpha: float, beta: float, delta: float, n_delay: int) -> tuple[_Wor
 
 
 def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[_World]:
-    """Return candidate worlds: per frequency that violates the condition, one tool with hands of several masses."""
+    """Return worlds to test: for each selected frequency, one tool, combined with hands of several masses."""
     w = np.union1d(np.geomspace(LOWEST, np.pi, NODES // 2), np.linspace(LOWEST, np.pi, NODES // 2))[:-1]
     one_minus_inverse = 1.0 - np.exp(-1j * w)
     coupling = beta + alpha / one_minus_inverse
@@ -174,7 +175,8 @@ def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[
     spring = (stiffness * one_minus_inverse / (1j * w)).real
     worlds = []
     for k in chosen.tolist():
-        # A mass M has the reactance 2 M tan(w/2). If X < 0, take the mass with the reactance -X, and a spring with 2 X.
+        # The world needs the reactance X; a mass M has the reactance 2 M tan(w/2). If X < 0, combine a mass with the
+        # reactance -X and a spring with the reactance 2 X.
         half = math.tan(0.5 * w[k])
         tool = float(np.clip(np.nan_to_num(abs(X[k]) / (2.0 * half), nan=np.inf), *TOOL_MASSES))
         spring_to_ground = -4.0 * X[k] * half if X[k] < 0 and tool < TOOL_MASSES[1] else 0.0
@@ -186,7 +188,7 @@ def _list_worlds(alpha: float, beta: float, delta: float, n_delay: int) -> list[
 
 
 def _build_loop(world: _World, delta: float, n_delay: int) -> tuple[LoopRoots, float]:
-    """Return the loop of the coupling and a world, and the sum of the masses of device and hand, its unit of mass."""
+    """Return the loop of the coupling with a world, and its unit of mass: the mass of device and hand together."""
     M, k, hand_mass, hand_stiffness = world
     total = 1.0 + hand_mass
     body = Body(1.0, delta / total, hand_stiffness / total)

@@ -141,7 +141,7 @@ def write_wall(
 
 
 class FilterCode(NamedTuple):
-    """Statements of a filter, which replace its input in the variable u by its output.
+    """Statements of a filter, which read its input from the variable u and store its output in u.
 
     The caller must multiply this output by the factor ``gain``.
     """
@@ -249,7 +249,7 @@ def write_memory(language: str, count: int, name: str, value: str, prefix: str =
 
     Args:
         language: "c" or "python".
-        count: length of the difference in periods; 0 without a difference. More than one past sample need an array.
+        count: length of the difference in periods; 0 without a difference. If it exceeds 1, the samples form an array.
         name: name of the state if a single past sample suffices.
         value: initial value of all past samples, as an expression in the language.
         prefix: beginning of the names of the array and of its index.

@@ -49,7 +49,7 @@ WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
 # Search for the wall of a cascade, whose integrator contains pos_gain = K/B and therefore depends on the wall
 MATCHED = 1e-5  # relative change of K/B below which the search has converged
-RESTARTS = (0.5, 0.1, 0.02)  # pos_gain at the start of further searches, relative to K/B without the integrator
+RESTARTS = (0.5, 0.1, 0.02)  # pos_gain at the start of further searches, relative to K/B of the wall without integrator
 MAX_MATCHES = 8  # largest number of walls chosen per search; 3 usually suffice
 # Factors on K and B, tried in this order, until the wall with its integrator satisfies the requirements
 REDUCTIONS = (1.0, 1.0 - 1e-5, 1.0 - 1e-4, 0.999, 0.99, 0.97, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
@@ -126,7 +126,7 @@ class Requirements(NamedTuple):
 
 
 def _read_limit(name: str, value: Any) -> Any:
-    """Convert a requirement given as text, such as "50%", "6 dB" or "30 deg", to a number; return others unchanged."""
+    """Convert a requirement given as a string, such as "50%" or "6 dB", to a number; return a number unchanged."""
     if not isinstance(value, str):
         return value
     try:
@@ -357,7 +357,7 @@ def _choose_free(
 
 
 class ControllerChoice(NamedTuple):
-    """The chosen wall of a scene, this scene, and its stiffest stable wall."""
+    """A chosen wall, the scene to which it belongs, and the stiffest stable wall of this scene."""
 
     scene: SceneOptima  # the given scene; for a cascade, a copy whose integrator contains pos_gain = K/B
     top: StiffestWall  # the stiffest stable wall of this scene
@@ -367,7 +367,7 @@ class ControllerChoice(NamedTuple):
 def choose_controller(
     scene: SceneOptima, requirements: Requirements, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> ControllerChoice:
-    """Choose the stiffest wall of a scene by `choose_wall`; for a cascade, with its integrator.
+    """Choose the stiffest wall that satisfies requirements; for a cascade, match the integrator to this wall.
 
     The integrator of a cascade integrates the velocity plus ``pos_gain`` times the position. Because ``pos_gain`` is
     K/B, each new wall changes the integrator. The search chooses a wall, matches the integrator to this wall and

@@ -141,6 +141,9 @@ class SceneAnalysis(SceneParts):
             A list, the stiffest first; ``stiffness`` in N/m and ``virtual_damping`` in N s/m are pairs: the smallest
             and the largest value on the island. Empty for a rigid scene, whose stable set is connected.
 
+        Raises:
+            InputError: couplings with arbitrarily large K are stable with a tool integrated by implicit Euler.
+
         Example:
             >>> import zwidth
             >>> timing, window = zwidth.Timing(period=1e-3, delay=1e-3), zwidth.WindowedDifference(samples=24)

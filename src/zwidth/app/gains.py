@@ -18,6 +18,7 @@ from zwidth.units.formatting import plain
 
 if TYPE_CHECKING:
     from zwidth.analysis.recommendation import Recommendation
+    from zwidth.analysis.scene import Scene
 
 _SINGULAR = {"turns": "turn", "degrees": "deg", "rad": "rad", "m": "m"}
 
@@ -56,6 +57,20 @@ def list_cascade(recommendation: Recommendation) -> dict[str, Any]:
         return {}
     units = "turns" if scene.unit_system.rotary else "m"
     return {**recommendation.cascade_gains(units)._asdict(), "units": units}
+
+
+def list_cascade_cautions(scene: Scene) -> list[str]:
+    """Return a list with the caution that pos_gain in the integrator of a cascade is not K/B; empty without it."""
+    feedback, K, B = scene.feedback, float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    if not (isinstance(feedback, IntegralFeedback) and feedback.is_cascade and B):
+        return []
+    pos_gain = float(feedback.position) / float(feedback.velocity)
+    if abs(pos_gain * B - K) <= 1e-5 * abs(K):
+        return []
+    return [
+        f"the integrator contains pos_gain = {plain(pos_gain)} 1/s, but this wall needs K/B = {plain(K / B)} 1/s; to "
+        "assess a cascade with this wall, use zwidth gains with the same options"
+    ]
 
 
 def format_cascade(recommendation: Recommendation) -> list[str]:

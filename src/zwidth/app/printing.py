@@ -170,7 +170,7 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def list_tool_notes(scene: Scene) -> list[str]:
-    """Return notes on a scene with a simulated tool: on other tools, and on K_max; an empty list without a tool."""
+    """Return notes on the virtual coupling of a scene with a simulated tool; an empty list without a tool."""
     if scene.tool is None:
         return []
     if scene.tool.every > 1:
@@ -178,8 +178,9 @@ def list_tool_notes(scene: Scene) -> list[str]:
         text = f"; its tool makes one step per {every} periods, at {rate}; margins and islands are not computed"
     elif scene.tool.integrator == "semi-implicit":
         text = (
-            "; its tool is integrated by semi-implicit Euler and therefore not passive, so a coupling that is safe for "
-            "every passive world may be unstable with it; lightest_tool returns the smallest mass"
+            "; its tool is integrated by semi-implicit Euler and therefore not passive, so even a coupling that is "
+            "stable with every passive world can be unstable with this tool; Scene.lightest_tool returns the smallest "
+            "stable mass"
         )
     else:
         text = ""
@@ -187,7 +188,7 @@ def list_tool_notes(scene: Scene) -> list[str]:
 
 
 def _list_narrow_regions(scene: Scene) -> list[str]:
-    """Return a caution if a coupling with half of K_max, at the damping of K_max, is unstable."""
+    """Return a list with a caution if half the maximum stiffness is unstable at the same damping; otherwise empty."""
     top = scene.max_stiffness()
     half = 0.5 * float(top.stiffness)
     if top.status != Status.OK or scene.is_stable(half, float(top.virtual_damping)):
@@ -290,13 +291,14 @@ def list_slopes(scene: Scene) -> list[Slope]:
         return []
     per, values = scene.sensitivities().per, scene.parameters()
     slopes, system = [], scene.unit_system
+    dampings = getattr(scene.device, "joint_dampings", {})
     for path, slope in per.items():
-        if path not in values:
-            # Skip the dampings of joints, because hinges and slides have different units, and the kind is unknown.
+        if path in dampings:
+            slopes.append(_spell_joint_slope(path, float(slope), dampings[path], system["N/m"]))
             continue
         unit, value = system[get_unit(path)], float(slope)
-        # Scale the parameter by its magnitude, because modal masses and weights of feedback may be negative. Scale a
-        # delay by the period, because the delay may be 0.
+        # The scale of a parameter is its absolute value, because modal masses and weights of feedback may be negative.
+        # The scale of a delay is the sampling period, because the delay may be 0.
         size = scene.timing.period if path == "delay" else abs(values[path])
         by_one = not size or unit == "N s/m"
         # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;
@@ -309,3 +311,20 @@ def list_slopes(scene: Scene) -> list[Slope]:
         words = f"{effect} for {with_unit(step, unit, 1)} more{note}"
         slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return slopes
+
+
+def _spell_joint_slope(path: str, slope: float, damping: float, unit: str) -> Slope:
+    """Return the derivative of K_max with respect to the damping of a joint, with its effect in words.
+
+    Args:
+        path: path of the damping.
+        slope: derivative, per N m s/rad (hinges) or per N s/m (slides).
+        damping: value of the damping in the same unit.
+        unit: unit of K_max.
+    """
+    # Name no unit of the damping, because hinges and slides have different units, and the kind of joint is not stored.
+    step, words = (0.1 * damping, "10 % more") if damping > 0 else (1e-3, "a damping of 0.001")
+    effect = "no change" if isfinite(slope) else "not computed"
+    if isfinite(slope) and (change := slope * step):
+        effect = f"{'+' if change > 0 else '-'}{with_unit(abs(change), unit, 3)}"
+    return Slope(path, slope, f"{unit} per SI unit", f"{effect} for {words}")

@@ -12,9 +12,10 @@ from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
-from zwidth.analysis.cautions import find_thin, price_passivity
+from zwidth.analysis.cautions import find_thin, price_passivity, summarize_thin
+from zwidth.analysis.optimization import explain_missing
 from zwidth.analysis.stabilization import stabilize
-from zwidth.app.gains import format_cascade
+from zwidth.app.gains import format_cascade, list_cascade_cautions
 from zwidth.app.printing import (
     format_diagnosis,
     format_hardware,
@@ -29,6 +30,7 @@ from zwidth.app.printing import (
     wrap_lines,
 )
 from zwidth.core.errors import InputError
+from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.safe_limit import reserve_damping
 from zwidth.stability.linear.passivity import find_obstacle
@@ -108,7 +110,8 @@ def format_check(
     alarm = spell_alarm(diagnosis, "exceeds the safe limit" if list_limit_cautions(scene) else "")
     lines = [format_line(word, wall_words + (alarm if word == "STABLE" else "")), format_line("device", device_words)]
     lines += [*format_parts(scene), *format_hardware(hardware)]
-    lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
+    cautions = [*list_omission_cautions(scene, omitted), *list_cascade_cautions(scene)]
+    lines += [format_line("CAUTION", text) for text in cautions]
     # With K = 0, print the stable dampings of a pure damper. Exclude measured responses, which have no poles and
     # therefore the frequency NaN.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency) and scene.loop.has_boundary
@@ -170,8 +173,11 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
     if isinf(verdict.stiffness_max):
         return [format_line("K_max", f"none: every K > 0 is stable at B = {damping} with this tool")]
     if not isfinite(verdict.stiffness_max):
-        none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
-        return [format_line("K_max", none)]
+        if isnan(verdict.frequency):
+            return [format_line("K_max", "the response certifies no wall")]
+        status = scene.max_stiffness().status
+        fault = "none" if status == Status.NO_BOUNDARY else "not computed"
+        return [format_line("K_max", f"{fault}: {explain_missing(scene, status)}")]
     top = f"{format_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [format_line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
@@ -287,7 +293,7 @@ def format_recommendation(
     omission_lines = [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     if verdict is None:
         return [format_line("NO WALL", recommendation.reason), *device, *omission_lines]
-    thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
+    thin = summarize_thin(find_thin(verdict, scene.timing.period))
     alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a grasp")
     margins = [format_line("margins", recommendation.spell_margins())]
     if verbose:

@@ -16,7 +16,7 @@ from pkgutil import iter_modules
 import click
 
 from zwidth.cli.commands import EXIT_FAILED, EXIT_INPUT, cli
-from zwidth.core.errors import ZwidthError
+from zwidth.core.errors import SYNONYMS, ZwidthError
 from zwidth.io.files import REMEDIES
 from zwidth.numerics.kernel_cache import use_compilation_cache
 
@@ -67,11 +67,24 @@ def _report(message: str) -> None:
 
 def _format_fault(error: click.ClickException) -> str:
     """Return the message for invalid arguments, which names the option, or the command that shows help."""
-    message = error.format_message()
+    if isinstance(error, click.NoSuchOption) and (option := _find_synonym(error)):
+        message = f"No such option {error.option_name!r}; write {option}"
+    else:
+        message = error.format_message()
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         return re.sub(r"^Invalid value for '?(.*?)'?: ", r"\1: ", message, count=1)
     context = getattr(error, "ctx", None)
     return f"{message.rstrip('.')}; see {context.command_path} --help" if context else message
+
+
+def _find_synonym(error: click.NoSuchOption) -> str:
+    """Return the option of the command whose name is a synonym of an unknown option, with an example; "" if none is."""
+    words = error.option_name.lstrip("-").replace("dead-time", "dead_time").split("-")
+    option = "--" + "-".join(SYNONYMS.get(word, word) for word in words)
+    known = [flag for each in error.ctx.command.params for flag in each.opts] if error.ctx else []
+    if option not in known or option == error.option_name:
+        return ""
+    return "--mass '1e-4 kg m^2'" if error.option_name == "--inertia" else option
 
 
 def _describe(error: Exception) -> str:

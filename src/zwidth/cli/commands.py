@@ -16,7 +16,7 @@ import click
 
 from zwidth import __version__
 from zwidth.app import printing
-from zwidth.app.gains import list_cascade
+from zwidth.app.gains import list_cascade, list_cascade_cautions
 from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
@@ -25,6 +25,7 @@ from zwidth.cli.options import (
     SHARE,
     Parsed,
     beyond_safe_option,
+    code_option,
     figure_option,
     find_omitted,
     folder_argument,
@@ -74,16 +75,21 @@ def cli() -> None:
 @cli.command(**show_example("check --stiffness '10 kN/m' --virtual-damping '40 N s/m'", OF_SCENE))
 @scene_options(wall=True)
 @hardware_options
+@code_option
 @verbose_option
 @json_option
-def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
+def check(scene: Any, hardware: dict[str, Any], code: Any, verbose: bool, as_json: bool) -> None:
     """Assess one wall: stability, margins and passivity; for an unstable wall, the changes that stabilize it.
 
     The options --stiffness, --mass (or --device) and --rate (or --period) are required; the defaults of damping and
     delay are 0. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). With
     --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and saturation.
-    The exit code is 0 for stable and for unstable walls.
+    With --code, it prints only a program for the control loop, if the wall is stable. The exit code is 0 for stable and
+    for unstable walls.
     """
+    if code:
+        click.echo(scene.code(language=code, max_force=hardware.get("max_force", math.inf)), nl=False)
+        return
     from zwidth.analysis.assessment import assess, limits_of
     from zwidth.analysis.stabilization import stabilize
     from zwidth.app.verdict import format_check
@@ -97,6 +103,7 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
         result["cautions"] = [
             *printing.list_limit_cautions(scene),
             *printing.list_omission_cautions(scene, find_omitted()),
+            *list_cascade_cautions(scene),
         ]
         result["islands"] = _list_islands(scene)
         unstable = verdict.stable is False and not verdict.marginal
@@ -138,7 +145,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         none = int(wall.status) == Status.NO_BOUNDARY
-        fault = "no wall with K > 0 is stable on this device" if none else "K_max of this device could not be computed"
+        fault = "this device has no K_max" if none else "K_max of this device could not be computed"
         raise click.ClickException(f"{fault}: {explain_missing(scene, wall.status)}")
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
@@ -188,8 +195,8 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
-    """Return the stability islands of a scene as dicts; None for a tool with ``every`` > 1 (not available)."""
-    return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
+    """Return the separate stable regions as dicts; None if they are not available with the tool of the scene."""
+    return [island._asdict() for island in scene.islands()] if scene.loop.has_pieces else None
 
 
 def _list_obstacles(scene: Any) -> list[str]:
@@ -378,9 +385,7 @@ _DEGREES = Parsed("DEGREES", read_degrees, "write degrees, such as 30")
 @hardware_options
 @beyond_safe_option
 @figure_option
-@click.option(
-    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
-)
+@code_option
 @verbose_option
 @json_option
 def recommend(
@@ -397,11 +402,11 @@ def recommend(
     The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
     Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
     --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
-    requirements; --grasps does not replace them. With --passive only, the result is the stiffest passive wall, which
-    publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
-    --friction or --max-force, the command also simulates the wall to find limit cycles and saturation; --max-force also
-    limits the force in the code of --code. A hand (--operator-...) is a part of the device, and the command also checks
-    the wall without this hand. The exit code is 1 if no wall exists.
+    requirements; --grasps does not replace them. With --passive as the only requirement, the result is the stiffest
+    passive wall, as in publications on passivity; add --phase-margin 30 --gain-margin 2 to keep the default margins.
+    With --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and
+    saturation; --max-force also limits the force in the code of --code. A hand (--operator-...) is a part of the
+    device, and the command also checks the wall without this hand. The exit code is 1 if no wall exists.
     """
     from zwidth.app.verdict import format_recommendation
 

@@ -9,7 +9,7 @@ import click
 # Options that specify a complete scene, for the examples in the help of several commands.
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
 
-OWN = "This command"  # heading of the options that belong to no other group
+OWN = "This command"  # heading of options that are specific to the command
 # Groups of options in the help: the heading of each group, and the prefixes of the options in it.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
@@ -35,7 +35,7 @@ class GroupedCommand(click.Command):
     """Command whose help lists its options in groups."""
 
     def __init__(self, *args: Any, own: tuple[str, ...] = (), **settings: Any) -> None:
-        """Create the command; the help lists the options in ``own`` under "This command", not in their usual group."""
+        """Create the command; its help lists the options in ``own`` under "This command", not in their usual group."""
         super().__init__(*args, **settings)
         self.own = own
 

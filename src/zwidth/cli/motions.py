@@ -65,10 +65,12 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 def _list_thin_margins(scene: Any) -> list[str]:
     """Return a list with one caution that names the small margins of a stable wall; empty if all are large enough."""
     from zwidth.analysis.assessment import assess
-    from zwidth.analysis.cautions import find_thin
+    from zwidth.analysis.cautions import explain_slow, find_thin
 
     verdict = assess(scene)
     thin = find_thin(verdict, scene.timing.period) if verdict.stable else []
+    if cause := explain_slow(scene, verdict, thin):
+        return [f"{thin[0]}: {cause}"]
     return [f"{', '.join(thin)}: see zwidth recommend for a wall with larger margins"] if thin else []
 
 
@@ -111,11 +113,12 @@ def simulate(
     A hit starts at the surface of the wall, at a sample, with the given speed; the wall is then unilateral and
     otherwise bilateral. Without --hit, --external-force and --hold the device is released at a depth of 1 mm (1 mrad if
     rotary), or of 50 encoder steps if --resolution is given. The row "in contact" states what zwidth diagnose finds for
-    a device that stays in the wall, which may differ from the simulated motion. With --tool-mass, a simulated tool
-    replaces the wall. The tool is initially at rest. The device starts at the tool with the speed --hit, or at the
-    distance --hold from the tool, and the row "linear loop" replaces the row "in contact". The options --stiffness,
-    --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options are taken from
-    SCENE.yaml (or from the folder of a run).
+    a device that stays in the wall, which may differ from the simulated motion. With --tool-mass, a virtual coupling
+    to a simulated tool replaces the wall. The tool is initially at rest. The device starts at the position of the tool
+    with the speed --hit, or at the distance --hold from the tool. The row "linear loop", which states whether the
+    coupling is stable, then replaces the row "in contact". The options --stiffness, --mass (or --device) and --rate (or
+    --period) are required. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a
+    run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
     from zwidth.simulation.behavior import describe_ending
@@ -201,7 +204,7 @@ def _choose_start(
 
 
 def _get_depth(options: dict[str, Any]) -> float:
-    """Return the initial depth in the wall, or distance from the tool, in the given arguments of `zwidth.simulate`."""
+    """Return the initial depth in the wall, or distance from the tool, that ``options`` of `zwidth.simulate` set."""
     start = options.get("start_position", 0.0)
     return abs(start.get("position", 0.0) - start["tool_position"]) if isinstance(start, dict) else start
 

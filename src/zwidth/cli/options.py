@@ -170,8 +170,8 @@ def scene_options(
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
-    option is given. If ``make`` is given, the command receives ``make(values, units)`` in place of the scene, with the
-    values of the given options by path, and the unit system of the options.
+    option is given. If ``make`` is given, the argument ``scene`` is instead the result of ``make(values, units)``:
+    ``values`` maps the path of each given parameter to its value, and ``units`` is the unit system of the options.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
     take = take_options(
@@ -286,7 +286,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return a scene with the values of options, ``given`` by path; add each part that the scene does not have."""
+    """Return a scene with the option values in ``given``, by parameter path; parts that options set are added."""
     from zwidth.model.devices import PublishedDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -334,7 +334,8 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     if published:
         _check_published(published, given, missing)
     if missing:
-        raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
+        normalized = f"; for normalized parameters, give only {instead}" if instead else ""
+        raise click.UsageError(f"give {', and '.join(missing)}{normalized}")
 
     def select(*names: str) -> dict[str, Any]:
         """Return the values that are given among the named parameters, as a dict by name."""
@@ -372,6 +373,9 @@ figure_option = click.option(
     "--figure", type=Parsed("FILE.png", _read_figure), help="Write a figure: FILE.png, .svg or .pdf."
 )
 beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
+code_option = click.option(
+    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
+)
 verbose_option = click.option("--verbose", is_flag=True, help="Print all results.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as JSON.")
 

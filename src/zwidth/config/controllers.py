@@ -6,7 +6,7 @@ They determine the keys ``stiffness``, ``virtual_damping`` and ``feedback`` of t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -21,12 +21,14 @@ from zwidth.model.controller_gains import (
     ControllerKind,
     ControllerParts,
     PositionUnit,
+    find_given_units,
     find_output_unit,
     find_units,
     make_controller,
 )
 from zwidth.model.feedback import IntegrationRule
 from zwidth.model.parameter_paths import spell_part
+from zwidth.units.parsing import detect_kind, looks_like_number
 from zwidth.units.quantities import POSITIVE
 
 Positive = Annotated[float, Quantity(allowed=POSITIVE)]
@@ -42,7 +44,8 @@ class ControllerSection(Strict):
     """Rule by which the controller computes its integral: forward in ODrive, trapezoidal in SimpleFOC."""
 
     units: PositionUnit | None = None
-    """Position unit of the gains. Default: turns for a cascade, rad for a PID controller; m for linear devices."""
+    """Position unit of the gains. Default: turns for a cascade; for a PID controller, rad, or m with a linear
+    device."""
 
     output_unit: Positive | None = None
     """Torque in N m (linear devices: force in N) per unit of the controller's output. Default: 1."""
@@ -53,13 +56,25 @@ class ControllerSection(Strict):
     resistance: Positive | None = None
     """Winding resistance of the motor in ohm, if the output of the controller is a voltage."""
 
+    @property
+    def gains(self) -> dict[str, float]:
+        """Gains by name, in the units of the controller."""
+        return {name: getattr(self, name) for name in GAIN_NAMES[self.name]}
+
+    @cached_property
+    def position_unit(self) -> PositionUnit:
+        """Position unit of the gains, either the given one or the default."""
+        return find_units(self.name, find_given_units(self.name, self.units), get_system().rotary)
+
+    @property
+    def output_scale(self) -> float:
+        """Torque in N m, or force in N, per unit of the controller's output."""
+        return find_output_unit(self.output_unit, self.torque_constant, self.resistance)
+
     @cached_property
     def parts(self) -> ControllerParts:
         """Wall and further feedback that follow from the gains; the position estimate is a key of the scene."""
-        gains = {name: getattr(self, name) for name in GAIN_NAMES[self.name]}
-        output_unit = find_output_unit(self.output_unit, self.torque_constant, self.resistance)
-        units = find_units(self.name, self.units, get_system().rotary)
-        return make_controller(self.name, gains, None, self.rule, units, output_unit)
+        return make_controller(self.name, self.gains, None, self.rule, self.position_unit, self.output_scale)
 
     def find_faults(self) -> Iterable[LocatedProblem]:
         try:
@@ -111,6 +126,23 @@ ControllerField = Annotated[
     Annotated[PidSection | CascadeSection, Field(discriminator="kind")],
     WrapValidator(lambda raw, _: read_controller(raw)),
 ]
+
+
+def implies_rotary(scene: Any) -> bool:
+    """Return whether a scene without units is rotary because its controller has gains in turns, degrees or rad.
+
+    ``scene`` is the mapping of a scene. Return False if a quantity of the scene has a unit of linear devices, because
+    the position unit of the controller is then an error.
+    """
+    controller = scene.get("controller") if isinstance(scene, Mapping) else None
+    if (
+        not isinstance(controller, Mapping)
+        or scene.get("rotary") is False
+        or not looks_like_number(str(scene.get("mass")))
+    ):
+        return False
+    units = find_given_units(controller.get("kind", "pid"), controller.get("units"))
+    return units in ("turns", "degrees", "rad") and all(detect_kind(value) is not False for value in scene.values())
 
 
 def derive_keys(raw: dict[str, Any]) -> dict[str, Any]:

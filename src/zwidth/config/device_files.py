@@ -1,6 +1,7 @@
-"""Read the device that the option ``--device`` of a command gives as a text or as the name of a file.
+"""Read the value of the option ``--device`` of a command: a description of a device, or the name of a device file.
 
-A device file (YAML or JSON) contains the value that the key ``device`` has in a configuration.
+A device file (YAML or JSON) describes one device, with the keys below ``device`` in a configuration file. A description
+is the name of a published device, a transfer function, or the name of a file with a measured frequency response.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _SUFFIXES = (".yaml", ".yml", ".json")
 
 
 def _refuse_configuration(raw: Any) -> Any:
-    """Return the content of a device file unchanged; raise an error if it is a whole configuration."""
+    """Return the content of a device file unchanged; raise an error if it is a complete configuration file."""
     if isinstance(raw, dict) and "version" in raw:
         allowed = "a file for --device has the keys of one device"
         raise problem("got a whole configuration", allowed, "give its name without --device")
@@ -32,22 +33,22 @@ def _refuse_configuration(raw: Any) -> Any:
 
 
 class _DeviceFile(RootModel[Annotated[DeviceForm, BeforeValidator(_refuse_configuration)]]):
-    """Model of a device file."""
+    """Pydantic model of the content of a device file."""
 
 
 def read_device_option(
     text: str, sampled: Any = None, *, rotary: bool = False
 ) -> PublishedDevice | Device | LinearDevice | MeasuredDevice:
-    """Return the device that the text of an option ``--device`` describes.
+    """Return the device that the value of the option ``--device`` describes.
 
     Args:
-        text: the name of a device file, in which names of other files are relative to its folder; or a text that
-            `zwidth.model.devices.read_device` accepts.
+        text: value of the option: the name of a device file, or a description that `zwidth.model.devices.read_device`
+            accepts. Names of other files in a device file are relative to the folder of the device file.
         sampled: sampling period in s for a transfer function in z; None for a transfer function in s.
-        rotary: True if other options have rotary units; a transfer function then describes a rotary device.
+        rotary: True if other options have rotary units; a device given by a transfer function is then rotary.
 
     Raises:
-        InputError: the text describes no device, or ``sampled`` is given for a device that is not a transfer function.
+        InputError: ``text`` describes no device, or ``sampled`` is given for a device that is not a transfer function.
         ConfigError: the device file cannot be read or is invalid.
     """
     if text.endswith(MODEL_SUFFIXES):

@@ -1,10 +1,10 @@
-"""Models of devices: a mass with damping, a linear system, a measured frequency response, and an arm with joints.
+"""Pydantic models of devices in configurations: a mass with damping, a linear system, a measured response, an arm.
 
-Sections are either in SI units ("physical") or normalized; `OneKind` reports keys of the other kind. A linear system
-or a measured response replaces mass, damping and mechanical parts. A linear system has one of four forms: numerator and
-denominator; zeros, poles and gain; the matrices A, B and C; or second-order sections. An arm with several joints
-(`zwidth.config.joint_devices`) is a linear system. If the arm moves like one mass along the direction of the wall, the
-keys ``mass`` and ``damping`` replace it.
+The *section* of a device is the mapping that describes it. Sections are either in SI units ("physical") or normalized;
+`OneKind` reports keys of the other kind. A linear system or a measured frequency response replaces mass, damping and
+mechanical parts. A linear system has one of four forms: numerator and denominator; zeros, poles and gain; the matrices
+A, B and C; or second-order sections. An arm with several joints (`zwidth.config.joint_devices`) is converted to a
+linear system, or to the keys ``mass`` and ``damping`` if it moves like one mass along the direction of the wall.
 """
 
 from __future__ import annotations
@@ -146,7 +146,8 @@ class ResponseSection(PartSection, noun="a response"):
 
 
 _Section = SystemSection | ResponseSection | MassMatrixSection
-# Keys that identify the model of a device; a mapping without any of these keys describes a linear system.
+# Keys that only one kind of device has, by the Pydantic model of this kind. A mapping without any of these keys
+# describes a linear system.
 _IDENTIFYING: dict[type[Strict], set[str]] = {
     ResponseSection: {"frequency"},
     MujocoSection: {"model", "site", "pose"},
@@ -155,7 +156,7 @@ _IDENTIFYING: dict[type[Strict], set[str]] = {
 
 
 def read_device_form(raw: Any) -> _Section:
-    """Return the model of a linear system, a measured response or an arm, from a mapping, a text or a file name."""
+    """Return the validated section of a linear system, a response or an arm, given as a mapping, a string or a file."""
     if isinstance(raw, _Section):
         return raw
     try:
@@ -179,10 +180,10 @@ def read_device_form(raw: Any) -> _Section:
 
 
 def replace_rigid(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace the key ``device`` of a mapping by ``mass`` and ``damping`` if it is an arm that moves like one mass.
+    """Replace the key ``device`` by ``mass`` and ``damping`` if its value is an arm that moves like one mass.
 
-    Return the mapping unchanged for other devices. Also return it unchanged if the arm is invalid or if the mapping
-    contains mass or damping, because the validation reports both errors.
+    Return the mapping ``raw`` unchanged if it contains another device. Also return it unchanged if the arm is invalid,
+    or if the mapping contains mass or damping, because the subsequent validation reports these errors.
     """
     device = raw.get("device")
     if not isinstance(device, dict | MassMatrixSection) or {"mass", "damping"} & raw.keys():
@@ -196,7 +197,8 @@ def replace_rigid(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
-# List `MujocoSection` only for the JSON Schema, because `read_device_form` converts it to a `MassMatrixSection`.
+# This union contains `MujocoSection` so that the JSON Schema describes it. `read_device_form` converts it to a
+# `MassMatrixSection`.
 DeviceForm = Annotated[_Section | MujocoSection, WrapValidator(lambda raw, _: read_device_form(raw))]
 
 
@@ -254,7 +256,7 @@ def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
 
 
 def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Yield a problem for each key (mass, damping, a part) that must not be given together with the given device."""
+    """Yield a problem for each key, such as ``mass`` or a mechanical part, that conflicts with the key ``device``."""
     device = keys.get("device")
     has_joints = isinstance(device, dict) and bool(_IDENTIFYING[MassMatrixSection] & device.keys())
     has_joints |= isinstance(device, MassMatrixSection) or (isinstance(device, dict) and "model" in device)
@@ -283,9 +285,9 @@ class SampledMass(OneKind):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Replace the name of a published device, or an arm that moves like one mass, by mass and damping.
+        """Replace ``device`` by mass and damping for a published device, and for an arm that moves like one mass.
 
-        Keys of the section override those of a published device.
+        The keys mass and damping of the section override the values of a published device.
         """
         name = raw.get("device")
         published = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
@@ -301,7 +303,7 @@ class SampledMass(OneKind):
         return super().prepare({**parameters, **{key: value for key, value in raw.items() if key != "device"}})
 
     device: DeviceForm | None = None
-    """Name of a published device, whose mass and damping apply unless they are given. Otherwise one of: a linear system
+    """Name of a published device; the keys mass and damping override its values. Otherwise one of: a linear system
     ('1 / 0.1 10 0' in s, or a mapping); a measured response (FILE.csv); an arm with joints, given by its mass matrix
     (mapping with the key mass_matrix) or by a model file (mapping with the keys model, site and direction)."""
 

@@ -1,8 +1,8 @@
-"""Models of arms with several joints in a configuration: a mass matrix, or a model file of the simulator MuJoCo.
+"""Pydantic models of arms with several joints in configurations, given by a mass matrix or by a MuJoCo model file.
 
-The wall acts on one point of the arm along one direction, and the arm is in one pose. A `MujocoSection` is converted to
-a `MassMatrixSection` when it is read, so that a saved configuration contains the matrices instead of the name of the
-model file.
+The arm is in one *pose*, a position of every joint, and the wall acts on one point of the arm along one direction. Each
+class describes a *section*, the mapping of one arm. When a configuration is read, a `MujocoSection` is converted to a
+`MassMatrixSection`, so that a saved configuration contains the matrices instead of the name of the model file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from zwidth.model.mujoco_model import linearize_model
 _ENTRY: dict[str, Any] = {"type": ["number", "string"]}
 _LIST: dict[str, Any] = {"type": "array", "items": _ENTRY, "minItems": 1}
 _ROWS: dict[str, Any] = {"type": "array", "items": {"type": "array", "items": _ENTRY}, "minItems": 1}
-# Accept every value here: `from_mass_matrix` checks the arrays, because their sizes must agree with each other.
+# These types accept every value, because `from_mass_matrix` checks the arrays together: their sizes must agree.
 _Matrix = Annotated[Any, WithJsonSchema(_ROWS)]
 _OfJoints = Annotated[Any, WithJsonSchema({"anyOf": [_ENTRY, _LIST, _ROWS]})]
 _Direction = Annotated[
@@ -49,8 +49,9 @@ class MassMatrixSection(PartSection, noun="a device with joints"):
     all joints, a list with one number per joint, or a matrix."""
 
     jacobian: _Matrix | None = None
-    """Jacobian of the point on which the wall acts: one row per axis, one column per joint. The column of a joint
-    without motor contains zeros. Default: the identity matrix, with the direction in joint coordinates."""
+    """Jacobian of the point on which the wall acts: one row per axis, one column per joint. Entries are numbers
+    in SI units, or lengths such as 20 cm. The column of a joint without motor contains zeros. Default: the identity
+    matrix; the direction is then in joint coordinates."""
 
     direction: _Direction | None = None
     """Direction of the wall: x, y or z, or a vector with one component per row of the Jacobian. Required unless the
@@ -84,14 +85,14 @@ class MujocoSection(Strict, noun="a device from a MuJoCo model"):
 
     pose: _Pose | None = None
     """Positions of the joints: a mapping such as {elbow: 60 deg}; a list of all positions, in rad and m or with units;
-    or the name of a keyframe. Default: the reference pose of the model."""
+    or the name of a keyframe, a pose in the model file. Default: the reference pose of the model."""
 
     rotary: Rotary = Field(default_factory=read_rotary)
     """True if the wall acts on the rotation about the direction, as for a knob."""
 
     @cached_property
     def joints(self) -> dict[str, Any]:
-        """The keys and values of the `MassMatrixSection` of the model in its pose."""
+        """The same arm described by its mass matrix: keys and values of a `MassMatrixSection`."""
         matrices = linearize_model(find_file(self.model), self.site, self.pose, rotary=bool(self.rotary))
         given = {name: values.tolist() for name, values in matrices._asdict().items()}
         return {**given, "direction": self.direction, **({"rotary": True} if self.rotary else {})}
@@ -101,5 +102,5 @@ class MujocoSection(Strict, noun="a device from a MuJoCo model"):
             from_mass_matrix(**self.joints)
         except InputError as error:
             path, fault = parse_input_error(error)
-            # Use the empty path, that of the section, for problems without a field, such as a missing package.
+            # Report a problem that concerns no field, such as a missing package, for the whole section: its path is ().
             yield (path if path[0] in type(self).model_fields else ()), fault

@@ -314,6 +314,7 @@ def build_parts(owner: Any) -> dict[str, Any]:
         for name, section in list_parts(owner).items()
     }
     if owner.rotary and isinstance(parts.get("device"), LinearDevice):
-        # Make the device rotary here, because its own section may have no rotary unit; the units of the file decide.
+        # Mark the device as rotary if any value of the file has a rotary unit. The section of the device does not
+        # suffice to decide this, because it may contain no such unit.
         parts["device"] = replace(parts["device"], rotary=True)
     return parts

@@ -25,6 +25,7 @@ from yaml.reader import Reader
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
+from zwidth.config.controllers import implies_rotary
 from zwidth.config.device_table import files_relative_to, find_file
 from zwidth.config.fields import (
     ConfigFileError,
@@ -99,7 +100,7 @@ def _check(
 
 
 def has_rotary_devices(data: Any, key: str = "") -> bool:
-    """Return whether a unit, ``rotary: true``, a published device or a data file indicates rotary devices.
+    """Return whether a unit, ``rotary: true``, a controller, a published device or a data file implies rotary devices.
 
     ``data`` is a configuration or one of its values, and ``key`` the key of this value.
     """
@@ -107,10 +108,12 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
         if "mass_matrix" in data or "model" in data:
-            # Use only the key ``rotary`` of an arm. The units of its joints, such as degrees and N m s/rad, imply
-            # nothing, because the wall may act on a linear motion of the arm.
+            # For an arm, return its key ``rotary``. Ignore the units of its joints, such as N m s/rad, because the
+            # wall may act on a linear motion of an arm with rotary joints.
             return data.get("rotary") is True
-        return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
+        return implies_rotary(data.get("scene")) or (
+            data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
+        )
     if isinstance(data, list):
         return any(has_rotary_devices(each, key) for each in data)
     if key == "device" and isinstance(data, str):
@@ -168,6 +171,14 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
             first += anchor.end() if anchor else 0
             values[first] = (value, first, first + len(text[first:last].rstrip()))
     return list(values.values())
+
+
+def read_section(path: Path, *keys: str) -> Any:
+    """Return the plain value of nested keys in a valid YAML file, without validation; None if a key is absent."""
+    value = _Tree(str(path), _read_text(str(path))).data
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
 
 
 def _fail(file: str, position: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:

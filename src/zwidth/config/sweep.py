@@ -215,7 +215,7 @@ class SweepStudy(_Parts, Study):
     """Parameters and their values; all combinations are computed."""
 
     device: DeviceForm | None = None
-    """Linear system, measured response or arm with joints, in place of mass and damping. Default: that of the scene."""
+    """Linear system, measured response or arm with joints, replacing mass and damping. Default: the scene's device."""
 
     rotary: Rotary = Field(default_factory=read_rotary)
     """True for rotary devices. One quantity with a rotary unit makes all devices of a file rotary."""
@@ -240,7 +240,7 @@ class SweepStudy(_Parts, Study):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Replace an arm that moves like one mass by the axes mass and damping, unless the axes contain one of them."""
+        """Replace an arm that moves like one mass by the axes mass and damping, unless one of these axes is given."""
         axes = raw.get("axes")
         if isinstance(axes, dict) and not {"mass", "damping"} & _list_given(axes):
             changed = replace_rigid(raw)

@@ -66,7 +66,10 @@ _MESSAGES = {
         "An input is invalid: alpha and beta must be finite, delta and d finite and >= 0; correct it."
     ),
     Status.NOT_CONVERGED: "The solver stopped before it reached its tolerance; use a nearby point or another method.",
-    Status.NO_BOUNDARY: "No wall on the given line of constant alpha or beta is stable; choose another value.",
+    Status.NO_BOUNDARY: (
+        "No wall on the given line is stable, or, for K_max, none that is connected to K = 0; choose another value, or "
+        "see islands."
+    ),
     Status.UNDECIDED: (
         "The precision or the data do not suffice to decide; use method='certified' (extra 'certified'); for a "
         "measured device, resolve its warnings."

@@ -344,6 +344,14 @@ def find_output_unit(output_unit: float | None, torque_constant: float | None, r
     return numbers.get("output_unit", numbers.get("torque_constant", 1.0) / numbers.get("resistance", 1.0))
 
 
+def find_given_units(kind: ControllerKind, units: PositionUnit | None) -> PositionUnit | None:
+    """Return the position unit of given gains; without ``units``, "turns" for a cascade and None for a PID controller.
+
+    None means that the kind of device, rotary or linear, determines the position unit.
+    """
+    return "turns" if units is None and kind == "cascade" else units
+
+
 def find_units(kind: ControllerKind, units: PositionUnit | None, rotary: bool) -> PositionUnit:
     """Return the position unit of the gains of a controller, checked against the kind of device.
 
@@ -357,8 +365,12 @@ def find_units(kind: ControllerKind, units: PositionUnit | None, rotary: bool) -
         return "m" if not rotary else "turns" if kind == "cascade" else "rad"
     check_choice("units", units, tuple(_UNITS))
     if (units == "m") == rotary:
-        allowed = "turns, degrees or rad" if rotary else "m, or write the inertia with its unit, such as '12 g cm^2'"
-        raise InputError(f"units: got {units!r} for a {'rotary' if rotary else 'linear'} device; use {allowed}")
+        default = " (default of a cascade)" if (kind, units) == ("cascade", "turns") else ""
+        linear = "m, or write the inertia in a rotary unit, such as '1e-4 kg m^2'"
+        allowed = "turns, degrees or rad" if rotary else linear
+        raise InputError(
+            f"units: got {units!r}{default} for a {'rotary' if rotary else 'linear'} device; use {allowed}"
+        )
     return units
 
 

@@ -1,15 +1,15 @@
-"""Devices with several joints, reduced to one direction of motion of a point, such as the handle of an arm.
+"""Models of arms with several joints, reduced to the motion of one point, such as a handle, along a unit vector n.
 
-The joints have coordinates q, the mass matrix M, the damping matrix D and the stiffness matrix S of springs to ground:
+J is the Jacobian of the point and J' its transpose. The joints have coordinates q with the velocities q', the mass
+matrix M, the damping matrix D and the stiffness matrix S of springs to ground:
 
     M q'' + D q' + S q = J' n f,    x = n' J q
 
-The wall measures the displacement x of the point along the unit vector n, with the Jacobian J of the point, and the
-motors produce the joint torques J' n f that correspond to a force f along n. The point is free in all other directions.
-With the Cholesky factor L of M = L L' and the coordinates L' q, the mass matrix becomes the identity, and force and
-position have the same vector w = L^-1 J' n. The smallest subspace that contains w, and that D and S map into itself, is
-the part of the motion that is excited and measured; all other motions are left out. If a single motion remains, the
-device is a rigid mass
+The wall measures the displacement x of the point along n, and the motors produce the joint torques J' n f that
+correspond to a force f along n. The point is free in all other directions. With the Cholesky factor L of M = L L' and
+the coordinates L' q, the mass matrix becomes the identity, and force and position have the same vector w = L^-1 J' n.
+The smallest subspace that contains w, and that D and S map into itself, is the part of the motion that is excited and
+measured; all other motions are left out. If a single motion remains, the device is a rigid mass
 
     m = 1/(n' J M^-1 J' n)
 
@@ -45,7 +45,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 class Joints(NamedTuple):
-    """Matrices of the joints and the vector J' n of the torques per unit force along n, all in SI units as tuples."""
+    """Matrices of the joints, and the joint torques J' n for a unit force along n; all as tuples, in SI units."""
 
     mass_matrix: tuple[tuple[float, ...], ...]
     damping: tuple[tuple[float, ...], ...]
@@ -55,7 +55,7 @@ class Joints(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class JointDevice(LinearDevice):
-    """Linear system of an arm with several joints along one direction, whose parameters are the joint dampings.
+    """Linear system of an arm with several joints, for a wall along one direction; its parameters are joint dampings.
 
     `from_mass_matrix` creates it. The damping of joint k, counted from 0, is the entry (k, k) of the damping matrix D.
     Its dotted path in a scene is "joints.k.damping", such as "joints.0.damping".
@@ -65,7 +65,7 @@ class JointDevice(LinearDevice):
     joints: Joints | None = None
 
     def __post_init__(self, sampled: Any) -> None:
-        # Always compute the system from the matrices of the joints, so that both agree.
+        # Always compute the linear system from the matrices of the joints, so that the two fields agree.
         M, D, S, vector = map(np.array, self._get_joints())
         reduced = _reduce(*_normalize(np.linalg.cholesky(M), vector, D, S))
         object.__setattr__(self, "system", _realize(*reduced))
@@ -80,7 +80,7 @@ class JointDevice(LinearDevice):
         """Return the mapping that describes the device in a configuration, under the key ``device``."""
         joints = self._get_joints()
         matrices = {name: [list(row) for row in getattr(joints, name)] for name in joints._fields[:3]}
-        # Write the vector J' n as a Jacobian with one row, which needs no direction.
+        # Write n' J as a Jacobian with one row: the direction n is already included, so no key ``direction`` is added.
         return {**matrices, "jacobian": [list(joints.vector)]}
 
     def _get_joints(self) -> Joints:
@@ -132,14 +132,15 @@ def from_mass_matrix(
 
     Args:
         mass_matrix: symmetric, positive definite matrix M of the joints, shape (joints, joints), in kg m^2 for hinges
-            and in kg for slides, including the inertia of the motors. All values of the three matrices are numbers in
-            these units, or texts with units such as "20 mN m s/rad".
+            and in kg for slides, including the inertia of the motors. All entries of the matrices of mass,
+            damping and stiffness are numbers in SI units, or strings with units such as "20 mN m s/rad".
         damping: viscous damping of the joints in N m s/rad (hinges) or N s/m (slides): one number, one per joint, or a
             symmetric matrix without negative eigenvalues.
         direction: direction n of the wall, of any length > 0: "x", "y" or "z", or a vector with one component per row
             of the Jacobian. It may be omitted if the Jacobian has a single row.
         jacobian: Jacobian J of the point, with one column per joint and one row per axis: the velocity of the point is
-            ``J q'`` for the joint velocities q'. None if ``direction`` is in joint coordinates.
+            ``J q'`` for the joint velocities q'. Entries are numbers in SI units, or lengths with a unit such as
+            "20 cm". None if ``direction`` is in joint coordinates.
         stiffness: stiffness of springs from the joints to ground in N m/rad or N/m, in the same form as ``damping``. A
             spring k between two coordinates has the matrix ``[[k, -k], [-k, k]]``.
         rotary: True if the direction is an axis of rotation; walls are then in N m/rad and N m s/rad.
@@ -166,7 +167,7 @@ def from_mass_matrix(
     """
     inertia = _read_matrix("mass_matrix", mass_matrix, None)
     joints = len(inertia)
-    vector = _project(direction, jacobian, joints)
+    vector = _project(direction, jacobian, joints, rotary=rotary)
     damper, spring = (
         _read_matrix(name, value, joints) for name, value in (("damping", damping), ("stiffness", stiffness))
     )
@@ -179,7 +180,7 @@ def from_mass_matrix(
         ) from None
     w, D, S = _reduce(*_normalize(factor, vector, damper, spring))
     if len(w) == 1 and S[0, 0] == 0.0:
-        # Solve with M instead of its factor, because a product of two square roots is not exact.
+        # Solve with M instead of its Cholesky factor, because the square of a rounded square root is not exact.
         mass = 1.0 / float(vector @ np.linalg.solve(inertia, vector))
         return Device(mass, float(D[0, 0]) * mass, rotary=rotary)
     joints = Joints(_to_tuples(inertia), _to_tuples(damper), _to_tuples(spring), tuple(vector.tolist()))
@@ -206,8 +207,11 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
         array = np.diag(np.broadcast_to(array, joints))
     shape = (joints, joints) if joints is not None else (len(array),) * 2 if array.ndim == 2 else None
     if array.shape != shape or not array.size:
-        allowed = "(joints, joints)" if joints is None else f"({joints}, {joints})"
-        raise InputError(f"{name}: got shape {array.shape}; it must be {allowed}")
+        got = f"shape {array.shape}" if array.ndim else "one number"
+        allowed = "a square matrix" if joints is None else f"a matrix of shape ({joints}, {joints})"
+        raise InputError(
+            f"{name}: got {got}; it must be {allowed} with one row per joint, such as [[0.03, 0], [0, 0.01]]"
+        )
     if not np.isfinite(array).all():
         raise InputError(f"{name}: got a value that is not finite; all must be finite numbers")
     size = np.abs(array).max()
@@ -222,25 +226,35 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
 
 
 def _convert_units(name: str, value: Any) -> Any:
-    """Return a matrix, a vector or a number with all texts, such as "20 mN m s/rad", converted to SI units.
+    """Return a matrix, a vector or a number with all strings, such as "20 mN m s/rad", in SI units.
 
     ``name`` is the name of the field, which determines the dimension: a mass, a damping or a stiffness, in the units of
-    rotation for hinges and of translation for slides.
+    rotation for hinges and of translation for slides; or a length for the Jacobian of hinges.
     """
     if isinstance(value, list | tuple):
         return [_convert_units(name, entry) for entry in value]
     if not isinstance(value, str):
         return value
-    return check_number(name, value, SYSTEMS[detect_kind(value) is not False][_UNITS[name]], ANY)
+    unit = "m" if name == "jacobian" else SYSTEMS[detect_kind(value) is not False][_UNITS[name]]
+    return check_number(name, value, unit, ANY)
 
 
-def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
-    """Return the joint torques J' n for a unit force along the direction n, with the Jacobian J; shape (joints,)."""
-    rows = np.eye(joints) if jacobian is None else _read_array("jacobian", jacobian)
+def _project(direction: Any, jacobian: Any, joints: int, *, rotary: bool) -> np.ndarray:
+    """Return the joint torques J' n for a unit force along the direction n, with the Jacobian J; shape (joints,).
+
+    The Jacobian of a rotary device has no lengths.
+    """
+    rows = np.eye(joints) if jacobian is None else _read_array("jacobian", jacobian, lengths=not rotary)
     if rows.ndim != 2 or rows.shape[1] != joints:
         raise InputError(f"jacobian: got shape {rows.shape}; it must be (axes, {joints}), one column per joint")
     if isinstance(direction, str):
         check_choice("direction", direction, tuple(_AXES))
+        names = list(_AXES)[: len(rows)]
+        if direction not in names:
+            raise InputError(
+                f"direction: got {direction!r}; the Jacobian has {len(rows)} row{'s' * (len(rows) > 1)}; use "
+                f"{' or '.join(map(repr, names))}, or add a row for each further axis"
+            )
         direction = _AXES[direction][: len(rows)]
     if direction is None and len(rows) > 1:
         raise InputError(f"direction: missing; give a vector of {len(rows)} components, or 'x', 'y' or 'z'")
@@ -255,21 +269,33 @@ def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
     return vector
 
 
-def _read_array(name: str, value: Any) -> np.ndarray:
-    """Convert a value to an array of finite numbers; ``name`` is the name of the field in error messages."""
+def _read_array(name: str, value: Any, *, lengths: bool = False) -> np.ndarray:
+    """Convert a value to an array of finite numbers.
+
+    Args:
+        name: name of the field in error messages.
+        value: value to convert.
+        lengths: True if texts with a unit of length are allowed.
+    """
     try:
-        array = np.array(value, float)
+        array = np.array(_convert_units(name, value) if lengths else value, float)
+    except InputError:
+        raise
     except (TypeError, ValueError):
         array = np.array(np.nan)
     if not np.isfinite(array).all():
-        raise InputError(f"{name}: got {value!r}; it must be finite numbers in SI units")
+        unit = ", or texts with a unit of length" if lengths else ""
+        raise InputError(f"{name}: got {value!r}; it must be finite numbers{unit}")
     return array
 
 
 def _normalize(
     factor: np.ndarray, vector: np.ndarray, damper: np.ndarray, spring: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return force vector w, damping D and stiffness S in the coordinates L' q, with the mass matrix M = L L'."""
+    """Return force vector, damping and stiffness in the coordinates L' q, whose mass matrix is the identity.
+
+    ``factor`` is L, the Cholesky factor of the mass matrix M = L L'. The other arguments are in the coordinates q.
+    """
 
     def transform(matrix: np.ndarray) -> np.ndarray:
         """Return L^-1 A L^-T for a symmetric matrix A and the Cholesky factor L; the result is exactly symmetric."""
@@ -284,7 +310,7 @@ def _reduce(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np
     """Restrict the system to the smallest subspace that contains the force vector w and is invariant under D and S.
 
     The damping D and the stiffness S are symmetric, so the orthogonal complement of the subspace is invariant as well:
-    its motions are neither excited nor measured.
+    motions in the complement are neither excited nor measured.
     """
     basis = [w / np.linalg.norm(w)]
     sizes = [float(np.linalg.norm(matrix, 2)) for matrix in (D, S)]
@@ -309,9 +335,10 @@ def _clear(matrix: np.ndarray, size: float) -> np.ndarray:
 def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a minimal state-space model (A, B, C) whose poles at s = 0, those of motions without springs, are exact.
 
-    The free motions N (the null space of the stiffness S) are those without springs, R are the other motions; q are
-    positions and v velocities. The free positions affect the output only by their sum w_N' q_N, which is one state y0;
-    the states are (y0, q_R, v_N, v_R). Without this separation, rounding errors would move the poles at s = 0.
+    The index N marks motions without springs (the null space of the stiffness S), the index R all other motions; q are
+    positions, v velocities and w the force vector. The positions q_N affect the output only by the scalar w_N' q_N,
+    which is the first state y0. The states are (y0, q_R, v_N, v_R). With all q_N as states, rounding errors would move
+    the poles at s = 0.
     """
     stiffness, vectors = np.linalg.eigh(S)
     free = stiffness <= NEGLIGIBLE * max(stiffness[-1], 0.0)

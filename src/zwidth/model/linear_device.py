@@ -94,7 +94,7 @@ class LinearDevice(ResponseDevice):
     Args:
         system: matrices ``(A, B, C)``; coefficients ``(numerator, denominator)`` with the highest power first; roots
             ``(zeros, poles, gain)``; a dict with the keys of a configuration, such as ``{"sos": sections}`` for
-            second-order sections; a text, "1 / 0.1 10 0", "zpk: / 0 -100 / 10" or "sos: b0 b1 b2 a0 a1 a2; ..."; or a
+            second-order sections; a string, "1 / 0.1 10 0", "zpk: / 0 -100 / 10" or "sos: b0 b1 b2 a0 a1 a2; ..."; or a
             model of scipy.signal (lti, dlti) or python-control (TransferFunction, StateSpace).
         sampled: sampling period of a discrete-time system in s, which must equal the period of the loop. A
             discrete-time system must include hold and delay. Default: the period of ``system``, if it has one;

@@ -55,7 +55,7 @@ class LoopEstimates:
 
     @property
     def uses_velocity(self) -> bool:
-        """True if the velocity V x of the device is needed separately, by the further feedback or from an observer."""
+        """True if the velocity V x of the device is an input of the further feedback or comes from an observer."""
         weights = None if self.feedback is None else self.feedback.weights
         return self.structure == "common" or (weights is not None and bool(np.any(weights.velocity != 0)))
 

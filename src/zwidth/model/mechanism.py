@@ -1,4 +1,4 @@
-"""Continuous-time model of the mechanism: up to three bodies in a row, structural modes and an actuator.
+"""Continuous-time model of a mechanism (*chain*): up to three bodies in a row, structural modes and an actuator.
 
 The bodies are the motor side of the device, its tip (the second mass behind a compliant coupling) and the hand of the
 operator. Each has a damper and a spring to ground; neighboring bodies are connected by a *link*, a spring and a damper.

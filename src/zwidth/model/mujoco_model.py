@@ -1,4 +1,4 @@
-"""Devices from models of the simulator MuJoCo, which also reads URDF files.
+"""Build devices from model files of the simulator MuJoCo, which also reads URDF files.
 
 A model determines the mass matrix, the joint damping, the joint springs and the Jacobian of one point in a given pose.
 The *point* is a site of the model, or a body if the model has no sites. A *pose* contains the positions of all joints;
@@ -22,16 +22,16 @@ from zwidth.model.linear_device import LinearDevice
 from zwidth.units.parsing import looks_like_number
 from zwidth.units.quantities import ANY
 
-MODEL_SUFFIXES = (".xml", ".urdf", ".mjb")  # endings of the names of model files
+MODEL_SUFFIXES = (".xml", ".urdf", ".mjb")  # file name extensions of models
 
 
 class JointSpace(NamedTuple):
     """Matrices of a model in one pose; the fields are arguments of `from_mass_matrix`."""
 
-    mass_matrix: np.ndarray  # mass matrix M with armature, shape (joints, joints), in kg m^2 or kg
-    damping: np.ndarray  # viscous damping of each joint, shape (joints,), in N m s/rad or N s/m
+    mass_matrix: np.ndarray  # mass matrix M with armature inertia, shape (joints, joints), in kg m^2 or kg
+    damping: np.ndarray  # viscous damping of each joint, shape (joints,), in N m s/rad (hinges) or N s/m (slides)
     jacobian: np.ndarray  # Jacobian J of the point, shape (3, joints); 0 in the columns of joints without a motor
-    stiffness: np.ndarray  # stiffness of the spring of each joint, shape (joints,), in N m/rad or N/m
+    stiffness: np.ndarray  # stiffness of the spring of each joint, shape (joints,), in N m/rad (hinges) or N/m (slides)
 
 
 def from_mujoco(
@@ -41,8 +41,8 @@ def from_mujoco(
 
     Mass matrix (with armature), Jacobian, joint damping and joint springs come from the model in the given pose. Joints
     with actuators are driven and measured, all others move passively; in a model without actuators, all joints are
-    driven. The wall replaces the gains of the actuators. Friction, contacts, and gravity are not included. Needs the
-    extra ``mujoco``.
+    driven. The wall replaces the gains of the actuators. Friction, contacts, and gravity are not included. Requires the
+    package extra ``mujoco``.
 
     Args:
         model: path of a model (MJCF ``.xml``, ``.urdf`` or ``.mjb``) or a ``mujoco.MjModel``.
@@ -50,12 +50,12 @@ def from_mujoco(
             name of a body, whose origin is the point.
         direction: "x", "y", "z" or a vector of three components in world coordinates.
         pose: pose of the model in one of four forms: a list of joint positions (``qpos``), as numbers in rad or m or as
-            texts such as "30 deg"; a dict of joint positions keyed by joint name, with all other joints in their
+            strings such as "30 deg"; a dict of joint positions keyed by joint name, with all other joints in their
             reference positions; the name of a keyframe of the model; None for the reference pose ``qpos0``.
         rotary: True for a wall that acts on the rotation about ``direction``, such as a knob or a steering wheel.
 
     Returns:
-        A `Device` or `LinearDevice`, as `from_mass_matrix`.
+        A `Device` or `LinearDevice`, as returned by `from_mass_matrix`.
 
     Raises:
         InputError: the model cannot be read, it has no such site or keyframe, or it contains equality constraints,
@@ -82,7 +82,7 @@ def linearize_model(model: Any, site: str, pose: Any = None, *, rotary: bool = F
         model: path of a model or a ``mujoco.MjModel``.
         site: name of the site, or of the body in a model without sites.
         pose: pose of the model, in any form that `from_mujoco` accepts.
-        rotary: True for the Jacobian of the rotation at the point, False for that of its translation.
+        rotary: True for the Jacobian of the rotation of the site or body, False for that of its translation.
     """
     mujoco, model = _import_mujoco(), load_model(model)
     _reject_constraints(model)
@@ -154,7 +154,7 @@ def load_model(model: Any) -> Any:
 
 
 def pack_model(path: Path) -> tuple[bytes, str]:
-    """Return a self-contained copy of a model file: its content, and the suffix of its name.
+    """Return a self-contained copy of a model file: its content in bytes, and its file name extension.
 
     The content is that of the file if the model needs no other files. Otherwise, for example with meshes or included
     files, it is the compiled model in MuJoCo's binary format ".mjb", which the same release of MuJoCo can read.
@@ -172,7 +172,7 @@ def pack_model(path: Path) -> tuple[bytes, str]:
 
 
 def _reject_constraints(model: Any) -> None:
-    """Raise `InputError` if a MuJoCo model contains parts that matrices of the joints do not describe."""
+    """Raise `InputError` if a MuJoCo model contains parts that the matrices of a `JointSpace` do not describe."""
     tendons = np.any(model.tendon_stiffness) or np.any(model.tendon_damping)
     faults = {
         "equality constraints": model.neq > 0,
@@ -213,13 +213,13 @@ def _read_pose(model: Any, pose: Any) -> np.ndarray:
 
 
 def _read_position(model: Any, index: int, value: Any) -> float:
-    """Convert one entry of ``qpos``, a number or a text with a unit, to rad (hinges) or m (slides).
+    """Convert one entry of ``qpos``, a number or a string with a unit, to rad (hinges) or m (slides).
 
     ``index`` is the index of the entry in ``qpos``.
     """
     (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
     name = model.joint(int(joint)).name
-    # Accept a number as text, because NumPy converts all entries of an array to texts if one of them is a text.
+    # Accept numbers given as strings, because NumPy converts all entries of an array to strings if one is a string.
     value = float(value) if isinstance(value, str) and looks_like_number(value) else value
     unit = "m" if list_joints(model).get(name) == "slide" else "rad"
     return check_number(f"pose.{name}", value, unit, ANY)
@@ -239,7 +239,7 @@ def _find_point(mujoco: Any, model: Any, name: str) -> tuple[str, int]:
 
 
 def _find_driven(mujoco: Any, model: Any) -> np.ndarray:
-    """Return a Boolean array, True for each degree of freedom with an actuator; all True without any actuators."""
+    """Return a Boolean array, True for each degree of freedom with an actuator; all True if no actuator exists."""
     if not model.nu:
         return np.ones(model.nv, bool)
     on_joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))

@@ -121,6 +121,11 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     owners |= {path: ("joints", path) for path in getattr(scene.device, "joint_dampings", ())}
     changed: dict[str, dict[str, Any]] = {}
     for path, value in changes.items():
+        if path not in owners and path.startswith("joints.") and isinstance(scene.device, Device):
+            raise InputError(
+                f"{path}: the device is a rigid mass along this direction and has no joint dampings; change 'damping', "
+                "or create the device again"
+            )
         if path not in owners:
             raise InputError(f"parameter: {describe_choice(path, tuple(owners))}")
         part, name = owners[path]

@@ -235,8 +235,8 @@ class Observer(Part):
         """The transfer functions P and V, each as a `PositionFilter`.
 
         Raises:
-            InputError: a numerator is invalid; the message names ``position.position`` or ``position.velocity``, the
-                field of this class, in place of the numerator of the filter.
+            InputError: a numerator is invalid; the message refers to it by the field of this class,
+                ``position.position`` or ``position.velocity``, not by the ``numerator`` of the `PositionFilter`.
         """
 
         def make(name: str) -> PositionFilter:

@@ -32,7 +32,7 @@ class ToolResponse(NamedTuple):
 
 
 class ToolStep(NamedTuple):
-    """One step of a tool at the position y, which changes by w: ``w = decay w - spring y + gain f; y = y + w``."""
+    """One step of a tool, which adds w to its position y: ``w = decay w - spring y + gain f; y = y + w``."""
 
     decay: Any
     spring: Any
@@ -69,12 +69,12 @@ class Tool(Part):
 
         With ``every`` = N > 1, the loop has the period N T (docs/theory/passivity.md, U9). The methods of a scene that
         return stability, spectral radius, poles, stable intervals or the maximum stiffness compute the eigenvalues of
-        its monodromy matrix; methods that need the stability boundary raise `InputError`. `Scene.poles` returns these
-        eigenvalues, i.e. poles per N periods, while spectral radius and decay rate refer to one period. The frequency
-        of the dominant pole is between 0 and ``1/(2 N T)``, because an eigenvalue does not determine multiples of
-        ``1/(N T)``. `Scene.max_stiffness` searches couplings with B >= 0 on a grid with at least 96 values of B and 32
-        values of K per decade, and refines the highest values. It does not find regions that are narrower than the
-        grid. It takes about 0.5 s.
+        its monodromy matrix, which maps the state of the loop over N periods. Methods that need the stability boundary
+        raise `InputError`. `Scene.poles` returns these eigenvalues. Spectral radius and decay rate refer to one period.
+        The frequency of the dominant pole is between 0 and ``1/(2 N T)``, because an eigenvalue does not determine
+        multiples of ``1/(N T)``. `Scene.max_stiffness` searches couplings with B >= 0 on a grid with at least 96 values
+        of B and 32 values of K per decade, and refines the highest values. It does not find regions that are narrower
+        than the grid. It takes about 0.5 s.
 
     References:
         Colgate, Stanley, Brown 1995, Proc. IROS, vol. 3 (virtual coupling); Adams, Hannaford 1999, IEEE Trans. Robotics
@@ -103,7 +103,7 @@ class Tool(Part):
     every: int = 1
 
     def respond(self, mass: Any, period: Any) -> ToolResponse:
-        """Return the response G_t = y/f of the tool, divided by T^2/m.
+        """Return the response G_t = y/f of the tool divided by T^2/m, its unit in m/N.
 
         Args:
             mass: m in kg, the unit of mass of the scene.

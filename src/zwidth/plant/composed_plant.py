@@ -61,7 +61,7 @@ def add_plants(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
 
 
 def _drop_at_one(roots: Array, count: int) -> Array:
-    """Remove ``count`` roots at exactly z = 1 (offset 0) from an array of offsets."""
+    """Remove ``count`` roots at exactly z = 1 (offset 0) from an array of offsets 1 - root."""
     return np.delete(roots, np.flatnonzero(roots == 0)[:count])
 
 
@@ -70,7 +70,7 @@ Terms = Sequence[tuple[float, Array, int]]  # gain, offsets of the zeros and pow
 
 def _find_zeros(terms: Terms) -> tuple[float, Array]:
     """Return the leading coefficient of the polynomial A, the sum of two terms, and the offsets of the zeros of A."""
-    # Split off the powers of z and of z - 1 that both terms of A have in common, so that these zeros are exact.
+    # Split off the powers of z and of z - 1 that the two terms have in common, so that these zeros of A are exact.
     powers = [int(np.sum(offsets == 1)) + power for _, offsets, power in terms]
     at_origin, at_one = min(powers), min(int(np.sum(offsets == 0)) for _, offsets, _ in terms)
     reduced = tuple(

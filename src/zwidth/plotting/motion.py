@@ -28,6 +28,8 @@ _CLIP = 8.0
 _GROWTH = 1.5
 # Length of the time axis if all motions leave the wall, as a multiple of the time at which the last contact ends.
 _WINDOW = 3.0
+_THIN = 0.9  # width of the lines of tip, hand and tool
+_BODIES = {"tip or hand": style.GREEN, "tool": style.VERMILION}  # colors of these lines in a figure of one motion
 _MAX_PANELS = 6  # largest number of motions in a figure of energies; if there are more, evenly spaced ones are drawn
 # Legend entry, color and line style of each energy.
 _ENERGIES = {
@@ -135,6 +137,9 @@ def _read_responses(table: Table) -> list[Any]:
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the position and the wall force of each motion over time; thin lines show tip, hand and tool.
 
+    With a tool, the force is that of the coupling on the tool, and there is no wall. A single motion has one color per
+    body; several motions have one color each.
+
     If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
     without bound is clipped at eight times the largest value of the smallest motion.
 
@@ -148,22 +153,33 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     names = {"tip_position_m": "tip or hand", "hand_position_m": "tip or hand", "tool_position_m": "tool"}
     further = [name for name in names if hasattr(motions[0], name)]
     words = ", ".join(dict.fromkeys(names[name] for name in further))
-    force = _name_force().replace("wall", "coupling") if "tool_position_m" in further else _name_force()
-    quantities = (("position_m", _name_position(), further), ("wall_force_N", force, []))
+    has_tool, single = "tool_position_m" in further, len(motions) == 1
+    force = _name_force().replace("wall", "coupling") if has_tool else _name_force()
+    loads = "coupling_force_N" if has_tool else "wall_force_N"
+    quantities = (("position_m", _name_position(), further), (loads, force, []))
     for ax, (name, label, others) in zip(panels, quantities, strict=False):
         factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
         for each in motions:
             look = each.look if name == "position_m" else {**each.look, **_ZERO_ORDER_HOLD}
             ax.plot(each.time_s * clock, getattr(each, name) * factor, label=each.label, zorder=3, **look)
             for other in others:
-                look = {**each.look, "linewidth": 0.6}
-                ax.plot(each.time_s * clock, getattr(each, other) * factor, label=f"{other}, {each.label}", **look)
-        ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
+                look = {**each.look, "linewidth": _THIN, **({"color": _BODIES[names[other]]} if single else {})}
+                entry = f"{other}, {each.label}"
+                ax.plot(each.time_s * clock, getattr(each, other) * factor, label=entry, zorder=4, **look)
+        if not has_tool:
+            ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
         ax.set_ylabel(f"{label}  in {unit}")
         _begin_at_zero(ax, max(float(each.time_s[-1]) for each in motions) * clock)
-    _mark_wall(panels[0], "y", motions)
+    if not has_tool:
+        _mark_wall(panels[0], "y", motions)
     panels[-1].set_xlabel(f"time  $t$  in {second}")
-    _add_legend(panels, motions, *([style.line(words, width=0.6)] if further else []), outside=axes is None)
+    entries = [style.line(f"thin: {words}", width=_THIN, color=style.BLACK)] if further else []
+    if single and further:
+        device = motions[0].look
+        entries = [style.line("device", device["linestyle"], color=device["color"])] * (not motions[0].label)
+        bodies = dict.fromkeys(names[name] for name in further)
+        entries += [style.line(body, width=_THIN, color=_BODIES[body]) for body in bodies]
+    _add_legend(panels, motions, *entries, outside=axes is None)
     return panels
 
 

@@ -44,7 +44,9 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 _FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar also has ticks at 2 and 5
 _LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
-_SMOOTH_GRID = 12  # from this many poses per axis on, colors are interpolated; up to this many, every pose has a tick
+# Number of poses per axis. On a grid with at least this many on both axes, colors are interpolated between poses. On a
+# coarser grid, every pose has a tick on axes with at most this many poses.
+_SMOOTH_GRID = 12
 _SEEN = 0.003  # fraction of a panel that corner optima must fill for a legend entry
 # Line style of boundaries, and style of the marker at the stiffest stable wall.
 _EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
@@ -308,9 +310,10 @@ def draw_workspace(
     quantity: str = r"maximum stable stiffness  $K_{\max}$",
     weakest_pose: str = "weakest pose",
 ) -> np.ndarray:
-    """Draw the maximum stiffness over two coordinates of a device's pose, and mark the pose with the smallest one.
+    """Draw the maximum stiffness over two coordinates of a device's pose, and mark the weakest pose.
 
-    A fine grid of poses is drawn as a surface with contours, a coarse grid as cells, and poses without a grid as dots.
+    A fine grid of poses is drawn as a surface with contours, a coarse grid as cells, and other poses as dots. The
+    weakest pose has the smallest maximum stiffness.
 
     Args:
         table: columns of a workspace study.
@@ -336,7 +339,7 @@ def draw_workspace(
     if min(shape) > 1 and np.array_equal(np.stack([x, y])[:, order], grid):
         values = factor * stiffness[order].reshape(shape)
         # Draw a coarse grid as cells, because interpolation between very different colors yields colors that are not
-        # in the color map. Also draw cells if some poses have no result, because only a cell can stay empty.
+        # in the color map. Also draw cells if some poses have no result, because a cell can be left blank.
         is_fine = min(shape) >= _SMOOTH_GRID
         shading = "gouraud" if is_fine and not np.ma.is_masked(stiffness) else "nearest"
         image = ax.pcolormesh(columns, rows, values, shading=shading, rasterized=True, norm=norm)

@@ -420,7 +420,7 @@ def poles(
 
 @_with_house_style
 def motion(motion: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
-    """Draw the position of one or several simulated motions over time; a thin line shows the simulated tool.
+    """Draw the position of one or several simulated motions over time, and that of a simulated tool as a thin line.
 
     Args:
         motion: Result of `zwidth.simulate` with recorded positions.

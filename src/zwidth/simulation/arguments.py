@@ -89,7 +89,7 @@ def count_periods(scenes: list[Any], periods: Any, duration: Any) -> int:
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return all arguments by name, with ``start_position`` and ``start_velocity`` split into one per body.
+    """Return all arguments by name, with one ``start_position`` and one ``start_velocity`` per body.
 
     An example of a new argument is "start_position.tip_position". A body for which the user specifies no initial value
     has that of the device. A tool has such an argument only if the user specifies its initial value.
@@ -245,7 +245,7 @@ def read_arguments(
 
 
 def refuse_unsupported(scenes: list[Any], contact: str, law: TracedLaw | None) -> None:
-    """Raise `InputError` if a scene has a tool that cannot be simulated with the contact or the force law."""
+    """Raise `InputError` if a scene has a tool that the contact, the force law or the velocity estimate excludes."""
     for scene in scenes:
         if scene.tool is None:
             continue

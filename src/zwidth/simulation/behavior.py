@@ -10,6 +10,8 @@ from zwidth.simulation.result import Motion, MotionKind
 from zwidth.units.display import find_unit
 from zwidth.units.formatting import with_unit
 
+SMALL = 1e-6  # amplitude in m (rad) below which a motion has decayed
+SMALL_RATIO = 1e-3  # the same, relative to the largest position
 WORDS = {
     MotionKind.REST: "comes to rest",
     MotionKind.DECAYING: "decays",
@@ -43,7 +45,15 @@ def describe_ending(motion: Motion, index: Any = ()) -> str:
         amplitude = with_unit(float(motion.amplitude[index]), find_unit(motion, "m"), 3)
         return f"{WORDS[kind]} at {with_unit(frequency, 'Hz', 3)}, amplitude {amplitude}, after {duration}"
     if kind is MotionKind.UNCLEAR:
+        positions = motion.position[index]
+        steps = np.diff(positions[-max(positions.size // 4, 2) :])
+        if np.all(steps >= 0) or np.all(steps <= 0):
+            return f"still moves in one direction after {duration}; simulate longer"
         return f"undecided after {duration}: too few oscillations; simulate longer"
     if kind is MotionKind.DECAYING:
-        return f"still decays after {duration}"
+        size, depth = float(motion.amplitude[index]), float(motion.penetration[index])
+        amplitude = with_unit(size, find_unit(motion, "m"), 3)
+        if size < max(SMALL, SMALL_RATIO * depth):
+            return f"decays to an amplitude of {amplitude} within {duration}"
+        return f"still decays after {duration}, amplitude {amplitude}"
     return f"{WORDS[kind]} within {duration}"

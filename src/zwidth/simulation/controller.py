@@ -194,7 +194,7 @@ def _find_distance(
     solved = tool.implicit & (k % tool.every == 0)
     distance = position - (controller.tool[0] + jnp.where(solved, _step_freely(tool, controller.tool), 0.0))
     if options.foaw or options.law is not None:
-        # With FOAW or a force law, all tools use the semi-implicit Euler method: e does not depend on f.
+        # With FOAW or a force law, all tools use the semi-implicit Euler method, so e does not depend on f.
         return distance
     gain, direct = jnp.where(solved, tool.gain, 0.0), estimator.filter.D / jnp.maximum(estimator.window, 1)
     return (distance - gain * params.beta * rest) / (1.0 + gain * (params.alpha + params.beta * direct))

@@ -128,8 +128,9 @@ class Motion:
             if there is no such body.
         wall_force: force of the wall from the instant on, in N; with an actuator, its commanded force.
         sticking: True if friction holds the device.
-        measured, estimated_velocity, command, contact: result of the control program at each sample. With a tool, the
-            velocity is that of the device relative to the tool, and the command that of the coupling.
+        measured, estimated_velocity, command, contact: result of the control program at each sample. With a tool,
+            ``estimated_velocity`` is the velocity of the device relative to the tool. ``command`` is the force on the
+            device, after the limits of the motor.
         tool_position: position y of the tool at each sample in m, from which the force is computed; None without a
             tool.
         coupling_force: force f of the coupling on the tool at each sample, in N, before the limits of the motor; None

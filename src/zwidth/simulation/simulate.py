@@ -90,7 +90,7 @@ def simulate(
             ``if``. Its force is sampled, held and delayed like that of a wall. With a tool, the position is p_k - y_k;
             a tool that is integrated by the implicit Euler method excludes a law.
         periods: number of sampling periods, >= 1; 1000 if left out.
-        duration: length of the simulation in s, or as a text such as "2 s" or "500 periods", in place of ``periods``;
+        duration: length of the simulation in s, or a string such as "2 s" or "500 periods", in place of ``periods``;
             rounded to an integer number of periods.
         substeps: recorded instants per period, >= 1.
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,

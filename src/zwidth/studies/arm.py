@@ -239,15 +239,16 @@ def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
 
 
 def _draw_poses(arm: Arm, coordinates: dict[str, np.ndarray], stiffness: np.ndarray, weakest: str) -> dict[str, Any]:
-    """Return a figure of K_max over the first two joints with several positions; an empty dict if fewer have them.
+    """Return a dict with a figure of K_max over the positions of two joints; empty if fewer than two joints vary.
 
-    At each point, the figure shows the smallest K_max over all directions and over all positions of the other joints.
+    The two joints are the first ones with several positions. At each point, the figure shows the smallest K_max over
+    all directions and over all positions of the other joints.
 
     Args:
-        arm: the arm.
-        coordinates: columns of the joint positions, one row per pose and direction.
-        stiffness: K_max of each row, in N/m.
-        weakest: text with the smallest K_max, its pose and its direction, for the legend.
+        arm: arm of the study.
+        coordinates: positions of each joint, by column name; one entry per combination of pose and direction.
+        stiffness: K_max in N/m for the same combinations.
+        weakest: legend entry with the smallest K_max, its pose and its direction.
     """
     several = [name for name, column in coordinates.items() if np.unique(column).size > 1]
     varied = several[:2]

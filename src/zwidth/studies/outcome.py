@@ -112,9 +112,10 @@ class CurvesStudy(ComputedStudy):
 
 
 def add_device_numbers(raw: dict[str, Any]) -> dict[str, Any]:
-    """Return the mapping of a study with the delta and d of its device, unless the mapping already contains them.
+    """Return the mapping of a study, extended by delta and d of its device unless these keys are given.
 
-    If the device is invalid, delta and d are 0, because the validation of the field ``device`` reports the errors.
+    If the device is invalid, add delta = 0 and d = 0, because the later validation of the key ``device`` reports its
+    errors.
     """
     if "device" not in raw:
         return raw

@@ -58,8 +58,8 @@ class RidgeStudy(CurvesStudy):
     kind: Literal["ridge"]
 
     device: PhysicalDevice | None = None
-    """Device in SI units. The curves include its parts, such as filters. Default: that of the scene, if it has parts
-    and delta or d is not given."""
+    """Device in SI units. The curves include the effects of its parts, such as filters. Default: the device of the
+    scene, if this device has parts, unless both delta and d are given."""
 
     two_scalings: bool = False
     """True to show small values of delta in a separate panel, as in Fig. 10 of the paper."""
@@ -72,7 +72,7 @@ class RidgeStudy(CurvesStudy):
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
-        if cls._list_absent(raw):  # with delta and d, the study does not use the scene
+        if cls._list_absent(raw):  # otherwise delta and d are given, and the scene is unused
             super().check_estimate(raw, scene)
 
     @classmethod
@@ -109,16 +109,17 @@ def device_ridge_table(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Compute the stiffest stable wall of a device with parts, for each combination of delta and d.
 
-    For each combination, delta determines the damping of the device and d its delay; all other parameters stay the
-    same. For a device with parts, the search excludes walls with B < 0 (`zwidth.Scene.max_stiffness`).
+    For each combination, the damping of the device follows from delta, and the delay from d; all other parameters are
+    those of ``device``. For a device with parts, the search excludes walls with virtual damping B < 0
+    (`zwidth.Scene.max_stiffness`).
 
     Returns:
-        A table and notes as those of `ridge_table`; the table also has columns of K and B in SI units.
+        A table and a list of notes, as from `ridge_table`. The table also contains K and B in SI units.
     """
     scene, changed = device.to_scene(), dict[str, np.ndarray]()
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
     if delta.tolist() != [device.delta]:
-        # Subtract the damping of a rigidly coupled hand, because delta contains the damping of device and hand.
+        # Subtract the damping of a rigidly coupled hand, because delta is the sum of the dampings of device and hand.
         hand = float(scene.damping - scene.device.damping)
         changed["damping"] = deltas * float(scene.units.virtual_damping) - hand
     if d.tolist() != [device.d]:
@@ -132,12 +133,12 @@ def device_ridge_table(
 
 
 def _name_kinds(codes: Any) -> np.ndarray:
-    """Return the names of `zwidth.RidgeKind` for an array of its codes."""
+    """Return an array with the name of each optimum in lower case, for an array of `zwidth.RidgeKind` codes."""
     return np.array([RidgeKind(int(code)).name.lower() for code in codes])
 
 
 def _note_missing(status: np.ndarray, delays: np.ndarray) -> list[str]:
-    """Return a note for each delay at which some points have no result."""
+    """Return a note for each delay d at which some points of the ridge could not be computed."""
     return [
         f"alpha_max: {count} of {np.count_nonzero(delays == value)} points have no result for d = {value:g}"
         for value in np.unique(delays)

@@ -29,8 +29,9 @@ _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-
 # search would take quadratic time for long texts that do not match.
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 
-# Pattern of the number at the start of a quantity, possibly with thousands separators and a decimal separator.
-_DIGITS = re.compile(r"\s*[-+]?[0-9][0-9.,'’_\u00a0\u2009\u202f ]*[0-9](?![0-9])")
+# Pattern of the number at the start of a quantity, possibly with thousands separators and a decimal separator. It
+# excludes the digit of units such as 1/s.
+_DIGITS = re.compile(r"\s*[-+]?[0-9](?:(?! 1/)[0-9.,'’_\u00a0\u2009\u202f ])*[0-9](?![0-9])")
 # Pattern of an integer with thousands separators, all of them the same character.
 _GROUPED = re.compile(r"[1-9][0-9]{0,2}(?:(?P<mark>[.,'’_\u00a0\u2009\u202f ])[0-9]{3})(?:(?P=mark)[0-9]{3})*")
 
@@ -284,7 +285,8 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         allowed, remedy = "it must be a number without a unit", f"write a number, e.g. {dimension.example}"
     text = _drop_separators(text)
     if looks_like_number(text) and not looks_like_number(str(value)):
-        raise UnusableValueError(got, "numbers without a unit have no separators", f"write {text}")
+        condition = " if the comma is a decimal point" if "." in text and "." not in str(value) else ""
+        raise UnusableValueError(got, "it must be one number without separators", f"write {text}{condition}")
     if looks_like_number(text):
         note = f" (it is then in {dimension.base})" if dimension.base else ""
         raise UnusableValueError(f"got the text {describe(value)}", allowed, f"drop the quotes{note}")

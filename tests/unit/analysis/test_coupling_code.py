@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import zwidth
 from zwidth.analysis.coupling_code import write_program
+from zwidth.cli.commands import cli
 
 T = 1e-3
 SAMPLES = 1000
@@ -110,6 +112,21 @@ def test_code_of_recommended_coupling():
     assert "typedef struct" in advice.code()
     with pytest.raises(zwidth.InputError, match="language: got 'java'"):
         advice.code("java")  # pyright: ignore[reportArgumentType]
+
+
+def test_code_of_a_chosen_coupling_to_a_slow_tool(tmp_path):
+    device, timing = zwidth.Device(mass="100 g", damping=10), zwidth.Timing(rate="1 kHz", delay="1 ms")
+    scene = zwidth.Scene(device, timing, tool=zwidth.Tool("300 g", every=8))
+    motion = scene.simulate("1.4 kN/m", "1 N s/m", external_force=1, periods=400)
+    expected = -motion.coupling_force
+    assert scene.code("1.4 kN/m", "1 N s/m", "c") == scene.code(1400, 1)
+    assert np.abs(drive_c(scene.code(1400, 1), motion.measured, tmp_path) - expected).max() < 1e-12
+    assert np.abs(drive_python(scene.code(1400, 1, "python"), motion.measured)[0] - expected).max() < 1e-12
+    with pytest.raises(zwidth.InputError, match=r"code: the wall K = 20\.00 kN/m, B = 1\.000 N s/m is not stable"):
+        scene.code("20 kN/m", 1)
+    options = "check --mass 100g --damping 10 --rate 1kHz --delay 1ms --tool-mass 300g --tool-every 8 --code python"
+    printed = CliRunner().invoke(cli, [*options.split(), "--stiffness", "1400", "--virtual-damping", "1"])
+    assert printed.output == scene.code(1400, 1, "python")
 
 
 def test_code_names_rotary_units():

@@ -47,6 +47,12 @@ def test_dampings_are_replaced_by_path():
     assert both.timing.period == 2e-3
 
 
+def test_path_of_a_joint_is_refused_for_a_rigid_mass():
+    arm = zwidth.from_mass_matrix(MASSES, jacobian=JACOBIAN, direction="x")
+    with pytest.raises(zwidth.InputError, match=r"joints\.0\.damping: the device is a rigid mass"):
+        zwidth.Scene(arm, TIMING).replace(**{"joints.0.damping": 0.02})
+
+
 def test_limits_contain_the_damping_of_the_joints():
     scene = make_scene([0.02, 0.05])
     (limit,) = [limit for limit in zwidth.limits_of(scene) if limit.name == "joints"]

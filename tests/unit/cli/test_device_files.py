@@ -82,3 +82,28 @@ def test_model_without_point_is_refused(check):
     code, output = check("<mujoco/>", file="arm.xml")
     assert code == 2
     assert "write model, site and direction into a file DEVICE.yaml" in output
+
+
+ARM = "mass_matrix: [[0.03, 0.01], [0.01, 0.01]]\njacobian: [[{}, -0.1], [0.1, 0.1]]\ndirection: {}\n"
+
+
+def test_jacobian_accepts_lengths_with_units(check):
+    assert check(ARM.format("-20 cm", "x")) == check(ARM.format("-0.2", "x"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (ARM.format("-0.2", "z"), "direction: got 'z'; the Jacobian has 2 rows; use 'x' or 'y', or add a row"),
+        (ARM.format("-20 deg", "x"), "jacobian: got '-20 deg', a rotary unit for a linear device"),
+        (
+            ARM.format("-20 cm", "x") + "rotary: true\n",
+            "jacobian: got [['-20 cm', -0.1], [0.1, 0.1]]; it must be finite",
+        ),
+        ("mass_matrix: 1 kg\ndirection: x\n", "mass_matrix: got one number; it must be a square matrix"),
+    ],
+)
+def test_invalid_matrices_are_refused(check, content, message):
+    code, output = check(content)
+    assert code == 2
+    assert message in output

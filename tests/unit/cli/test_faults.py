@@ -14,6 +14,15 @@ SCENE = ["--mass", "100 g", "--rate", "1 kHz"]
     [
         (["chek"], "Error: No such command 'chek'. (Did you mean one of: 'check', 'schema'?); see zwidth --help"),
         (["check", *SCENE], "Error: give --stiffness; see zwidth check --help"),
+        (
+            ["check", "--inertia", "3"],
+            "Error: No such option '--inertia'; write --mass '1e-4 kg m^2'; see zwidth check --help",
+        ),
+        (["check", "--dead-time", "3"], "Error: No such option '--dead-time'; write --delay; see zwidth check --help"),
+        (
+            ["admittance", "--robot-bandwidth", "3"],
+            "Error: No such option '--robot-bandwidth'; write --robot-cutoff; see",
+        ),
         (["check", "--stiffness", "1 kN/m"], "Error: give --mass or --device, and --rate or --period; see zwidth"),
         (["check", *SCENE, "--stiffness", "1 kN"], "Error: --stiffness: got '1 kN'; "),
         (["run", "nowhere.yaml"], "Error: nowhere.yaml: no such file; check the path"),

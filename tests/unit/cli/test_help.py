@@ -45,7 +45,10 @@ def test_help_fits_80_columns_without_unit_one(name):
         ("check --stiffness 1 --mass 1", "give --rate or --period"),
         ("check --stiffness 1 --rate 1000", "give --mass or --device"),
         ("recommend --damping 1", "give --mass or --device, and --rate or --period"),
-        ("ridge --delta 0.1 --d 1 --mass 1", "give either --delta and --d alone, or also --rate or --period"),
+        (
+            "ridge --delta 0.1 --d 1 --mass 1",
+            "give --rate or --period; for normalized parameters, give only --delta and --d",
+        ),
     ],
 )
 def test_missing_options_are_named(command, message):

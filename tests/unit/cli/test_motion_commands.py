@@ -176,3 +176,21 @@ def test_invalid_options_are_named(options, message):
     result = CliRunner().invoke(cli, ["simulate", *HANDLE, *SOFT, *options])
     assert result.exit_code != 0
     assert message in result.output + str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("duration", "ending"),
+    [("300 ms", "still moves in one direction after 300 ms"), ("8 s", "decays to an amplitude of")],
+)
+def test_push_without_oscillation_is_named(duration, ending):
+    wall = ["--mass", "100 g", "--damping", "1", "--rate", "1kHz", "--delay", "1 ms", "--stiffness", "100"]
+    more = ["--virtual-damping", "50", "--external-force", "1 N", "--duration", duration]
+    result = CliRunner().invoke(cli, ["simulate", *wall, *more])
+    assert ending in " ".join(result.output.split())
+
+
+def test_small_remaining_amplitude_is_printed():
+    wall = ["--mass", "100 g", "--damping", "1", "--rate", "1kHz", "--delay", "1 ms", "--stiffness", "1 kN/m"]
+    more = ["--virtual-damping", "5", "--external-force", "1 N", "--duration", "400 ms"]
+    result = CliRunner().invoke(cli, ["simulate", *wall, *more])
+    assert "decays to an amplitude of" in " ".join(result.output.split())

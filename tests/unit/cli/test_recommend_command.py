@@ -194,3 +194,15 @@ def test_margins_accept_decibels_and_degrees(options, requirements):
 )
 def test_invalid_requirement_names_its_option(options, message):
     assert message in recommend(*options, code=2).output
+
+
+def test_slow_sliding_of_an_arm_is_named(tmp_path):
+    file = tmp_path / "arm.yaml"
+    matrix, jacobian = "[[0.003, 0.001], [0.001, 0.001]]", "[[-0.2, -0.1], [0.1, 0.1]]"
+    text = f"mass_matrix: {matrix}\njacobian: {jacobian}\ndamping: [2e-4, 5e-4]\ndirection: y\n"
+    file.write_text(text, encoding="utf-8")
+    arguments = ["recommend", "--device", str(file), "--rate", "1 kHz", "--delay", "1 ms"]
+    text = " ".join(CliRunner().invoke(cli, arguments).stdout.split())
+    assert "CAUTION: slow decay device" in text
+    assert "margins gain 2.11, phase 30.0 deg" in text
+    assert "CAUTION slow decay (time constant 2.9 s): a motion of the arm that hardly depends on the wall" in text

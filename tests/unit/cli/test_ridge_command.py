@@ -112,3 +112,63 @@ def test_largest_coupling_in_a_narrow_region_is_named(tool, narrow):
     checked = CliRunner().invoke(cli, ["check", *system, *wall])
     assert checked.output.startswith("UNSTABLE" if narrow else "STABLE")
     assert any("do not set a coupling near K_max" in note for note in found["notes"]) == narrow
+
+
+@pytest.mark.parametrize(
+    ("damping", "effect"),
+    [
+        ("[0.02, 0.05]", r"joints\.1\.damping\)  .* kN/m per SI unit: \+\d+ N/m for 10 % more"),
+        ("[0, 0.05]", r"joints\.0\.damping\)  .* N/m per SI unit: .* for a damping of 0\.001"),
+    ],
+)
+def test_joint_dampings_have_sensitivities(tmp_path, damping, effect):
+    file = tmp_path / "arm.yaml"
+    matrix, jacobian = "[[0.003, 0.001], [0.001, 0.001]]", "[[-0.2, -0.1], [0.1, 0.1]]"
+    file.write_text(
+        f"mass_matrix: {matrix}\njacobian: {jacobian}\ndamping: {damping}\ndirection: y\n", encoding="utf-8"
+    )
+    assert re.search(effect, ridge("--device", str(file), "--rate", "1 kHz", "--delay", "1 ms"))
+
+
+# Options of scenes that have stable walls, but no K_max: with the implicit tool, couplings of arbitrarily large K are
+# stable; on the undamped device, all stable walls with B >= 0 are on islands.
+IMPLICIT = ["--mass", "2.326 g", "--damping", "14.35 mN s/m", "--period", "947 us", "--delay", "1 period"]
+IMPLICIT += ["--velocity-kind", "butterworth", "--velocity-cutoff", "110.7 Hz", "--velocity-order", "3"]
+IMPLICIT += ["--tool-mass", "2 g", "--tool-integrator", "implicit"]
+UNDAMPED = ["--mass", "2.55 kg cm^2", "--coupling-mass", "7.08 kg cm^2", "--coupling-stiffness", "1.324 N m/rad"]
+UNDAMPED += ["--period", "2.432 ms", "--delay", "0.43 periods", "--velocity-samples", "19", "--damping", "0"]
+UNDAMPED += ["--tool-mass", "1.28 kg cm^2", "--tool-damping", "1.9e-5 N m s/rad"]
+
+
+@pytest.mark.parametrize(
+    ("options", "wall", "fault"),
+    [
+        (IMPLICIT, ("30 N/m", "0.1 N s/m"), "not computed: stable couplings exist for arbitrarily large K"),
+        (IMPLICIT, ("3 kN/m", "0.1 N s/m"), "not computed: stable couplings exist for arbitrarily large K"),
+        (UNDAMPED, ("1.7 N m/rad", "25 mN m s/rad"), "none: no stable wall with B >= 0 is connected to K = 0"),
+    ],
+)
+def test_missing_maximum_with_stable_walls_is_explained(options, wall, fault):
+    arguments = ["check", *options, "--stiffness", wall[0], "--virtual-damping", wall[1]]
+    printed = " ".join(CliRunner().invoke(cli, arguments).output.split())
+    assert printed.startswith("STABLE")
+    assert f"K_max {fault}" in printed
+    for command in ("ridge", "recommend"):
+        result = CliRunner().invoke(cli, [command, *options])
+        assert result.exit_code == 1
+        assert fault.partition(": ")[2] in " ".join(result.output.split())
+        assert "at any damping" not in result.output
+
+
+def test_islands_of_unlimited_couplings_are_refused():
+    scene = zwidth.Scene(
+        zwidth.Device("2.326 g", "14.35 mN s/m"),
+        zwidth.Timing("947 us", "1 period"),
+        velocity=zwidth.Butterworth("110.7 Hz", 3),
+        tool=zwidth.Tool("2 g", integrator="implicit"),
+    )
+    assert scene.is_stable(["30 N/m", "3 kN/m", "3 MN/m"], "0.1 N s/m").all()
+    assert not scene.is_stable("500 N/m", "0.1 N s/m")
+    assert scene.max_stiffness().status == zwidth.Status.NOT_CONVERGED
+    with pytest.raises(zwidth.InputError, match="no boundary at high stiffness"):
+        scene.islands()

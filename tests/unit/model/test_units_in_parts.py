@@ -128,7 +128,10 @@ def test_rotary_operator_with_coupling_accepts_units():
         (lambda: SCENE.is_stable("10 kN", 40), "stiffness: got '10 kN'; the units allowed are N/m"),
         (lambda: SCENE.is_stable("10,000 N/m", 40), "thousands separator; write '10000 N/m' or '10.000 N/m'"),
         (lambda: zwidth.Device(mass="10,000"), "mass: got '10,000'; .* write '10000' or '10.000'"),
-        (lambda: zwidth.Device(mass="0,1"), "numbers without a unit have no separators; write 0.1$"),
+        (
+            lambda: zwidth.Device(mass="0,1"),
+            "it must be one number without separators; write 0.1 if the comma is a decimal point$",
+        ),
         (lambda: zwidth.Timing("1 ms", rate="1 kHz"), "timing: got both; pass either period"),
         (lambda: zwidth.Device(mass="0.07"), r"mass: got the text '0.07'; .*drop the quotes \(it is then in kg\)"),
         (lambda: zwidth.Device(mass="-70 g"), "mass: got -0.07 kg; it must be greater than 0 kg"),

@@ -65,7 +65,7 @@ def test_summary_agrees_with_the_simulation(impact, motion):
 def test_notes_state_the_final_state(impact):
     assert impact.notes[:2] == (
         "0.6 of K_max (linearly stable): comes to rest within 300 ms",
-        "0.95 of K_max (linearly stable): still decays after 300 ms",
+        "0.95 of K_max (linearly stable): still decays after 300 ms, amplitude 15.2 µm",
     )
     assert impact.notes[2].startswith("1.05 of K_max (linearly unstable): bounces: impact velocity from 144")
 
@@ -225,6 +225,20 @@ def test_coupling_to_a_tool():
     assert force[0] == pytest.approx(0.98 * top.stiffness * 0.5e-3, rel=1e-9)
     panels = outcome.figures[""]()
     assert panels[1].get_ylabel().startswith("coupling force")
+
+
+def test_figure_of_a_tool_names_its_lines():
+    wall = {"stiffness": 1e3, "virtual_damping": 5}
+    study = make_study(device=TOOL, start_position=1e-3, tool_position=0.0, walls=[wall])
+    panels = study.compute(None, True).figures[""]()
+    assert panels[0].get_ylabel().startswith("position")
+    assert [line.get_label().partition(",")[0] for line in panels[0].lines] == ["K = 1.000 kN/m", "tool_position_m"]
+    (curve,) = panels[1].lines
+    assert np.asarray(curve.get_ydata())[0] > 0
+    (legend,) = (each for each in (*panels[0].figure.legends, panels[0].get_legend()) if each is not None)
+    tool_line = legend.get_lines()[-1]
+    assert legend.get_texts()[-1].get_text() == "tool"
+    assert tool_line.get_color() == panels[0].lines[1].get_color() != panels[0].lines[0].get_color()
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from zwidth.units.parsing import (
     ANGULAR_DAMPING,
     ANGULAR_SPEED,
     ANGULAR_STIFFNESS,
+    BANDWIDTH,
     DAMPING,
     DIMENSIONS,
     FORCE,
@@ -116,6 +117,9 @@ def test_quantity_is_the_float_nearest_to_the_text(dimension, text, value):
         (ANGULAR_DAMPING, "1 N m s/rev", 0.5 / math.pi),
         (INERTIA, "60 gcm2", 6e-6),
         (INERTIA, "60 g cm²", 6e-6),
+        (RATE, "1000 1/s", 1000.0),
+        (RATE, "5 1/s", 5.0),
+        (BANDWIDTH, "1 500 1/s", 1500.0),
     ],
 )
 def test_compound_and_customary_units_are_read(dimension, text, value):
@@ -180,7 +184,8 @@ def test_suggestion_has_the_same_magnitude(dimension, text, suggestion):
     [
         ("1,000 N/m", "the comma is ambiguous: decimal or thousands separator; write '1000 N/m' or '1.000 N/m'"),
         ("1,00,0.5 N/m", "not in groups of three"),
-        ("1,5", "have no separators; write 1.5"),
+        ("1,5", "it must be one number without separators; write 1.5"),
+        ("1000,2000", "it must be one number without separators; write 1000.2000 if the comma is a decimal point"),
     ],
 )
 def test_ambiguous_separators_are_rejected(text, message):

@@ -241,7 +241,7 @@ class Controls:
             raise InputError(f"{name}: coefficients can only be set in a configuration file; choose another kind")
         changes = {name: parts[kind]}
         if has_velocity(changes.get("position")):
-            # Reset the velocity estimate, because a phase-locked loop estimates the velocity, too.
+            # Reset the velocity estimate to its default, because a phase-locked loop also estimates the velocity.
             changes["velocity"] = BackwardDifference()
         return replace(self, scene=scene.replace(**changes))
 

@@ -263,7 +263,7 @@ def _find_turns(
     part, each = loops.loop.take(turns.loop), _take_line(line, turns.loop, w.shape[1])
 
     def evaluate_slope(x: Array) -> Array:
-        """Return the derivative of k, which is 0 at an extremum."""
+        """Return the derivative of k, which is 0 at an extremum of k."""
         return combine(each, split_values(evaluate(loops.form, part, x))[1])
 
     low, high, first, last = (values[turns.cell + k, turns.loop] for values in (w, slope) for k in (0, 1))

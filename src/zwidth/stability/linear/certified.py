@@ -146,7 +146,7 @@ def _add_tool(
         D, N1, N2: the polynomials of the device.
         velocity: velocity estimate V_t of the tool.
         response: response G_t of the tool.
-        common: 1 if D and the denominator of G_t have a common zero at exactly z = 1, which counts once; otherwise 0.
+        common: 1 if D and the denominator of G_t have a common zero at exactly z = 1, of which one is omitted; else 0.
     """
     import flint
 

@@ -42,17 +42,18 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
 
 
 def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse) -> StateSpace:
-    """Return the controller with a virtual coupling to a tool in state space, from the position x to the force.
+    """Return the controller of a virtual coupling to a tool, in state space from the device position x to the force.
 
     The coupling computes ``f = alpha (P x - y) + beta (V x - V_t y)``. The tool has the position y = G_t f.
-    The force is f + R x. If V belongs to no observer and is no input of R, one filter computes the relative velocity.
+    The force on the device is f + R x with the further feedback R. One filter computes the relative velocity, unless an
+    observer estimates V x or R needs V x as an input.
     """
     estimates = chain.estimates or LoopEstimates(velocity=chain.estimate)
     if estimates.uses_velocity:
         # Filter x and y separately, because V x is needed as an input of R, or an observer computes it.
         program, sources = realize_estimates(estimates), np.array([[alpha, beta, 0.0], [0.0] * 3, [0.0, 0.0, 1.0]])
     else:
-        # Omit the velocity filter: the second output is then its input, P x, or x for the structure "separate".
+        # Omit the velocity filter from the program, whose second output is then the input of this filter (P x or x).
         program = realize_estimates(replace(estimates, velocity=Estimate(0)))
         sources = np.array([[alpha, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     plant = factor_tool(tool)
@@ -61,8 +62,9 @@ def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse)
         realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles)),
     )
     # The states are those of the program, the velocity filter and the tool.
-    # Each signal is a row vector: the factors of all states and, in the last column, of x.
-    # The filter has the input rest - y. The coupling has the force spring - alpha y + beta (output of the filter).
+    # Each signal is a row vector: the factors of all states and, in the last column, of the device position x.
+    # ``rest`` and ``spring`` do not depend on the tool position y. The velocity filter has the input rest - y,
+    # and the coupling has the force spring - alpha y + beta (output of the filter).
     sizes = [len(program.A), len(difference.A), len(response.A)]
     ends = np.cumsum([0, *sizes])
     rows = np.eye(ends[-1] + 1)

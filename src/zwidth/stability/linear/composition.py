@@ -78,7 +78,7 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
     V, gain, lag = estimates.velocity, device.gain * float(F.gain), device.lag + F.lag
     if estimates.structure == "separate":
         # The tool has the velocity estimate V_t = V, so the velocity part of the loop is V H + V_t G_t = V (H + G_t).
-        # The zeros of F = V/P are first those of V, then the poles of P.
+        # The array ``F.zeros`` contains first the zeros of V, then the poles of P, because F = V/P.
         # If V is an input of R, the poles of V are zeros of H, and cancel in V H.
         released = V.poles[: 0 if device.free_poles.size else None]
         zeros = np.concatenate([device.free_zeros, F.zeros[np.size(V.zeros) :], released])
@@ -101,7 +101,7 @@ def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: F
 
 
 def _build_plant(gain: float, lag: int, zeros: np.ndarray, poles: np.ndarray) -> FactoredPlant:
-    """Return a plant with the given factors, where ``lag`` = -k < 0 becomes k zeros at z = 0."""
+    """Return the plant with the given zeros, poles and gain, times z^-lag; ``lag`` = -k < 0 adds k zeros at z = 0."""
     return FactoredPlant(gain, max(lag, 0), np.concatenate([zeros, np.ones(max(-lag, 0))]), poles)
 
 

@@ -104,7 +104,7 @@ def _add(first: FactoredPlant, second: FactoredPlant, a: float = 1.0, b: float =
     if not a or not b:
         filter_, factor = (first, a) if a else (second, b)
         return replace(filter_, gain=factor * filter_.gain)
-    # Multiply both filters by z^lag with the lag of the second filter; the last line divides the sum by it.
+    # Multiply both filters by z^lag with the lag of the second filter; the last line divides the sum by z^lag.
     lag = second.lag
     moved = [replace(first, gain=a * first.gain, lag=first.lag - lag), replace(second, gain=b * second.gain, lag=0)]
     early = max(lag - first.lag, 0)

@@ -43,7 +43,9 @@ class StateTerms:
     """Taylor expansion of the response of a device's states to a unit command from rest, for time in periods."""
 
     def __init__(self, A: Taylor, B: Taylor, one: Taylor, fraction: Taylor, sampled: bool) -> None:
-        """Compute Psi, the transition matrix over one period minus 1, and Gamma(t), the states at t = 1 and t = 1 - f.
+        """Compute Psi, the transition matrix over one period minus the identity, Gamma(1) and Gamma(1 - f).
+
+        Gamma(t) is the vector of the states at the time t, in periods, after a unit command from rest.
 
         Args:
             A, B: matrices of the device, in discrete time if ``sampled`` is True, otherwise in continuous time.
@@ -58,7 +60,7 @@ class StateTerms:
             self.late = flow(A, B, one - fraction)[1]
 
     def respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
-        """Return the matrix zeta - Psi, and the states x as transfer functions of the command, without the lag.
+        """Return the matrix zeta - Psi, and the responses x of the states to the command, without the factor z^-(n+1).
 
         The states are ``x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1))`` at ``zeta = z - 1``; x[0] is the position.
         """
@@ -178,7 +180,7 @@ class LoopTerms:
     def _estimate_coupling(self, ratio: Jet, lam: Taylor) -> Jet:
         """Return the velocity estimate F of a coupling and dF/dlambda, from the ratio V/P of the device.
 
-        F is (V H + V_t G_t)/G with G = P H + G_t, so it is ``q (V/P/q_d - V_t G_t)`` with q_d = -1/(P H).
+        With G = P H + G_t, q = -1/G and q_d = -1/(P H), F is ``(V H + V_t G_t)/G = q (V/P/q_d - V_t G_t)``.
         """
         assert self.estimates is not None
         tool = evaluate_estimate(self.estimates.of_tool, lam, self.one)
@@ -243,7 +245,7 @@ def differentiate(
     equations: Equations,
     added_delay: float | None = None,
 ) -> list[Taylor]:
-    """Return the unknowns of equations, with their derivatives in the numbers of a scene and in further parameters.
+    """Return the solution of equations, with its derivatives in the numbers of a scene and in further parameters.
 
     Args:
         scene: the scene, whose numbers are floats.

@@ -44,16 +44,16 @@ LARGEST = 1e100  # entry of a monodromy matrix above which the products H S, H^2
 class SlowToolModel:
     """State-space model of the loop for all values of alpha and beta, the normalized K and B of the coupling.
 
-    A *row* r defines a signal ``r Z``, a linear function of the state Z.
+    A row vector r yields a signal ``r Z``, a linear function of the state Z.
     """
 
     every: int  # N, periods per step of the engine
-    drift: Array  # map of the state over one period without a coupling force, minus the identity
+    drift: Array  # transition matrix of the state over one period without a coupling force, minus the identity
     force: Array  # change of the state per unit of the force f, which acts on the device with the opposite sign
-    distance: Array  # row of the distance e from the tool to the device
-    velocity: Array  # row of the velocity estimate F e
-    increment: Array  # row of w, the increment of y per step
-    step: Array  # row of the change of w in a step of the tool without a coupling force
+    distance: Array  # row vector that yields the distance e from the tool to the device
+    velocity: Array  # row vector that yields the velocity estimate F e
+    increment: Array  # row vector that yields w, the increment of y per step
+    step: Array  # row vector that yields the change of w in a step of the tool without a coupling force
     moved: Array  # change of the state if y increases by 1 while the device stays where it is
     gain: float  # change of w per unit of the force f in a step of the tool
     feedthrough: float | None  # direct feedthrough of the velocity estimate; None for "semi-implicit"
@@ -121,7 +121,7 @@ class SlowToolModel:
         return multipliers, logs
 
     def _build_maps(self, alpha: Array, beta: Array) -> tuple[Array, Array]:
-        """Return the matrices H and S (period without and with a step of the tool) minus the identity, per coupling."""
+        """Return the maps H and S of the state over a period without and with a tool step, all minus the identity."""
         f = alpha[:, None] * self.distance + beta[:, None] * self.velocity
         hold = self.drift - self.force[:, None] * f[:, None, :]
         change = self.step + self.gain * f
@@ -135,7 +135,7 @@ class SlowToolModel:
 
 
 def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
-    """Return the states of a device at rest at the position 1, without forces; None unless the device is free.
+    """Return the states of a device at rest at the position 1; None if the device has no pole at z = 1.
 
     Args:
         chain: model of the device.
@@ -143,13 +143,13 @@ def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
     """
     if not np.any(find_roots(chain).poles == 0):
         return None
-    # These states are constant without forces, so they are in the null space of psi. The first state is the position.
+    # A free device stays at rest, so psi times these states is 0. The first state is the position, which is 1.
     rest = np.linalg.lstsq(psi[:, 1:], -psi[:, 0], rcond=None)[0]
     return np.concatenate([[1.0], rest])
 
 
 def _compute_logs(multipliers: Array) -> Array:
-    """Return the largest ``log|eigenvalue|`` for eigenvalues minus 1; 0 if it is below its rounding error."""
+    """Return the largest ``log|eigenvalue|`` from eigenvalues minus 1; 0 if it is below the rounding error."""
     each = log_modulus(multipliers)
     logs = each.max(-1)
     near = np.flatnonzero(np.abs(logs) < np.sqrt(ROUNDING))
@@ -160,12 +160,12 @@ def _compute_logs(multipliers: Array) -> Array:
 
 
 def _compose(second: Array, first: Array) -> Array:
-    """Return the product ``second first``; arguments and result are matrices minus the identity."""
+    """Return the product of two matrices, ``second first``; all three are stored minus the identity."""
     return second + first + second @ first
 
 
 def _raise(matrix: Array, power: int) -> Array:
-    """Return a power >= 1 of a matrix by repeated squaring; argument and result are minus the identity."""
+    """Return a power >= 1 of a matrix by repeated squaring; both are stored minus the identity."""
     result = None
     while True:
         if power & 1:
