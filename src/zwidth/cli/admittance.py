@@ -42,6 +42,13 @@ def _add_lag(command: Any) -> Any:
     return command
 
 
+class _HiddenArgument(click.Argument):
+    """An argument that the usage line of a command does not show."""
+
+    def get_usage_pieces(self, ctx: click.Context) -> list[str]:
+        return []
+
+
 def _refuse_files(_context: click.Context, _argument: click.Parameter, files: tuple[str, ...]) -> None:
     """Raise `click.UsageError` if an argument without option is given, such as the path of a file."""
     if files:
@@ -57,7 +64,7 @@ def _refuse_files(_context: click.Context, _argument: click.Parameter, files: tu
     ),
     own=("--virtual-damping",),
 )
-@click.argument("files", nargs=-1, metavar="", is_eager=True, expose_value=False, callback=_refuse_files)
+@click.argument("files", nargs=-1, cls=_HiddenArgument, is_eager=True, expose_value=False, callback=_refuse_files)
 @click.option("--virtual-mass", type=quantity_type("kg", POSITIVE), required=True, help="Virtual mass M, in kg.")
 @click.option(
     "--virtual-damping", type=quantity_type("N s/m", NOT_NEGATIVE), required=True, help="Virtual damping D, in N s/m."

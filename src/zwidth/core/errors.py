@@ -36,6 +36,10 @@ class UnusableValueError(InputError):
         return "; ".join(part for part in self.parts if part)
 
 
+class UnknownArgumentError(InputError, TypeError):
+    """A keyword argument that a constructor does not have."""
+
+
 class ConfigError(ZwidthError, ValueError):
     """An invalid configuration file; the message lists all faults with line and column."""
 
@@ -89,12 +93,20 @@ def format_install_command(extra: str) -> str:
     return f"scripts/setup {extra}" if by_script else f"pip install 'zwidth[{extra}]'"
 
 
-def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
-    """Return the part of a message with the received name, the allowed names, and the most similar of these, if any."""
+def describe_choice(value: object, allowed: tuple[str, ...], similarity: float = 0.6) -> str:
+    """Return the part of a message with the received name, the allowed names, and the most similar of these, if any.
+
+    Args:
+        value: the received name.
+        allowed: the allowed names.
+        similarity: least similarity of a suggested name, from 0 to 1 (`difflib.get_close_matches`).
+    """
     import difflib
 
     synonym = SYNONYMS.get(str(value))
-    nearest = [synonym] if synonym in allowed else difflib.get_close_matches(str(value), allowed, n=1)
+    nearest = (
+        [synonym] if synonym in allowed else difflib.get_close_matches(str(value), allowed, n=1, cutoff=similarity)
+    )
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     return f"got {value!r}, allowed are {', '.join(repr(name) for name in allowed)}{hint}"
 

@@ -11,13 +11,13 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, fields
-from functools import wraps
+from functools import cache, wraps
 from numbers import Real
 from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
-from zwidth.core.errors import InputError, UnusableValueError, check_choice
+from zwidth.core.errors import InputError, UnknownArgumentError, UnusableValueError, check_choice, describe_choice
 from zwidth.core.pytrees import HiddenText, is_node, register, register_waiting
 from zwidth.core.types import Array
 from zwidth.core.xp import is_jax, is_traced, namespace, stop_gradient
@@ -151,6 +151,20 @@ def _in_si(name: str, value: Any, period: Any, system: UnitSystem) -> Any:
     return _map_texts(read, value)
 
 
+@cache
+def _find_signature(kind: type) -> inspect.Signature:
+    """Return the signature of the constructor of a class, without ``self``."""
+    signature = inspect.signature(kind.__init__)
+    return signature.replace(parameters=list(signature.parameters.values())[1:])
+
+
+class _ConstructorSignature:
+    """The attribute ``__signature__`` of parts, because `inspect` would otherwise use that of ``Part.__new__``."""
+
+    def __get__(self, part: Any, kind: type) -> inspect.Signature:
+        return _find_signature(kind)
+
+
 class Part:
     """Base class of the parts of a scene.
 
@@ -162,6 +176,18 @@ class Part:
     _texts: ClassVar[tuple[str, ...]] = ()  # fields with texts for the user; JAX does not compile again if they change
     # Names of the children; set if JAX creates the part, because the types of its children are then arbitrary.
     _child_names: tuple[str, ...] | None = None
+
+    __signature__ = _ConstructorSignature()
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Create an object of the class; raise `UnknownArgumentError` if the constructor lacks a keyword argument."""
+        if kwargs:
+            names = tuple(_find_signature(cls).parameters)
+            for name in (each for each in kwargs if each not in names):
+                # Suggest only very similar names, because "virtual_mass" is no replacement for "virtual_stiffness".
+                text = describe_choice(name, names, 0.75).replace("got", "got the argument", 1)
+                raise UnknownArgumentError(f"{cls.__name__}: {text}")
+        return super().__new__(cls)
 
     def __init_subclass__(cls) -> None:
         """Register each subclass as a node of JAX pytrees."""

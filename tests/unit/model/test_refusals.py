@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import jax
 import numpy as np
 import pytest
@@ -104,3 +106,26 @@ def test_invalid_scenes_are_rejected(make, field, remedy):
     message = str(error.value)
     assert message.startswith(field + ":"), message
     assert remedy in message, message
+
+
+@pytest.mark.parametrize(
+    "kind, arguments, message",
+    [
+        (
+            zwidth.Device,
+            {"inertia": 1},
+            r"Device: got the argument 'inertia', allowed are 'mass', .*; did you mean 'mass'",
+        ),
+        (zwidth.Actuator, {"bandwidth": 10}, r"Actuator: got the argument 'bandwidth', .*; did you mean 'cutoff'"),
+        (zwidth.AdmittanceDisplay, {"virtual_stiffness": 3}, r"got the argument 'virtual_stiffness', .*'integrator'$"),
+        (zwidth.Timing, {"period": 1e-3, "latency": 1e-3}, r"Timing: got the argument 'latency', .* mean 'delay'"),
+    ],
+)
+def test_unknown_arguments_are_refused_with_the_allowed_ones(kind, arguments, message):
+    with pytest.raises(zwidth.InputError, match=message) as caught:
+        kind(**arguments)
+    assert isinstance(caught.value, TypeError)
+
+
+def test_signature_of_a_part_is_that_of_its_constructor():
+    assert list(inspect.signature(zwidth.Timing).parameters) == ["period", "delay", "rate"]
