@@ -34,7 +34,7 @@ def test_results_have_one_structure_in_all_transformations(case):
 @pytest.mark.parametrize("question", ["max_stiffness", "sensitivities", "margins", "dominant_pole", "boundary"])
 def test_structure_does_not_depend_on_units_or_precision(question):
     """Units of linear and rotary devices belong to the display of a result, and not to its structure."""
-    timing = zwidth.Timing("1 ms", 1)
+    timing = zwidth.Timing("1 ms", "1 periods")
     linear = zwidth.Scene(zwidth.Device("100 g", "1 N s/m"), timing)
     rotary = zwidth.Scene(zwidth.Device("1 g m^2", "0.01 N m s/rad"), timing)
     walls = {"margins": (0.5, 0.01), "dominant_pole": (0.5, 0.01), "boundary": (np.array([10.0, 20.0]),)}

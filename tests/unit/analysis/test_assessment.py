@@ -184,7 +184,7 @@ def test_assess_rejects_scene_without_wall():
 
 
 def test_assess_many_rejects_too_many_poles_before_computing(monkeypatch):
-    late = zwidth.Scene(DEVICE, zwidth.Timing(1e-3, 5.0), WALL, SLOW)
+    late = zwidth.Scene(DEVICE, zwidth.Timing(1e-3, "5 s"), WALL, SLOW)
     monkeypatch.setattr(zwidth.Scene, "max_stiffness", lambda scene: pytest.fail("the boundary is laid out"))
     (row,) = zwidth.assess_many([late])
     assert row["status"] == "INVALID_INPUT"

@@ -331,7 +331,7 @@ def test_command_line_and_configuration(tmp_path):
     assert "8.011 kN/m" in ridge.output
     refused = CliRunner().invoke(cli, ["recommend", *options])
     assert refused.exit_code != 0
-    assert "set every=1" in refused.output
+    assert "is available only for every = 1" in refused.output
     (tmp_path / "sweep.yaml").write_text(
         """
 version: 1

@@ -356,7 +356,7 @@ def test_walls_within_the_uncertainty_of_a_measurement_are_undecided(tmp_path):
 
 def test_walls_out_of_range_have_their_status(tmp_path):
     device = {"mass": 1e-30, "damping": 1e-30, "period": 1e3}
-    scene = zwidth.Scene(zwidth.Device(1e-30, 1e-30), zwidth.Timing(1e3), velocity=zwidth.LowPass(cutoff=1e-4))
+    scene = zwidth.Scene(zwidth.Device(1e-30, 1e-30), zwidth.Timing("1000 s"), velocity=zwidth.LowPass(cutoff=1e-4))
     # alpha = K T^2/m is 1e66.
     stiffness, statuses = [1e-20, 1e30], [Status.OK, Status.OUT_OF_RANGE]
     assert scene.decide_stability(stiffness, 0.0).status.tolist() == statuses
