@@ -297,12 +297,12 @@ def list_slopes(scene: Scene) -> list[Slope]:
             slopes.append(_spell_joint_slope(path, float(slope), dampings[path], system["N/m"]))
             continue
         unit, value = system[get_unit(path)], float(slope)
-        # The scale of a parameter is its absolute value, because modal masses and weights of feedback may be negative.
-        # The scale of a delay is the sampling period, because the delay may be 0.
+        # The printed change of a parameter is relative to its absolute value, because modal masses and weights of
+        # feedback may be negative. That of a delay is relative to the sampling period, because the delay may be 0.
         size = scene.timing.period if path == "delay" else abs(values[path])
         by_one = not size or unit == "N s/m"
-        # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;
-        # 1 N s/m for a linear damping; 1 or, for rotary devices, 1e-3 if the scale is 0.
+        # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of this size;
+        # 1 N s/m for a linear damping; 1 or, for rotary devices, 1e-3 if the size is 0.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "no change" if isfinite(value) else "not computed"
         if isfinite(value) and (change := value * step):

@@ -129,10 +129,10 @@ ControllerField = Annotated[
 
 
 def implies_rotary(scene: Any) -> bool:
-    """Return whether a scene without units is rotary because its controller has gains in turns, degrees or rad.
+    """Return whether the gains of a controller, in turns, degrees or rad, imply that the device of a scene is rotary.
 
-    ``scene`` is the mapping of a scene. Return False if a quantity of the scene has a unit of linear devices, because
-    the position unit of the controller is then an error.
+    ``scene`` is the mapping of a scene. Return False if another quantity of the scene has a unit of linear devices; the
+    position unit of the controller is then reported as an error.
     """
     controller = scene.get("controller") if isinstance(scene, Mapping) else None
     if (

@@ -27,7 +27,7 @@ class Jet(NamedTuple):
     """Value and derivative of a complex function of one variable, usually the angle w."""
 
     value: Array
-    slope: Array  # derivative with respect to the variable
+    slope: Array  # derivative with respect to the variable of the function, for example the angle w
 
     def times(self, other: Jet) -> Jet:
         """Return the product with another function, with the derivative by the product rule."""

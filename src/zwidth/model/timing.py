@@ -105,7 +105,7 @@ class Timing(Part):
         timing, (period, delay) = object.__new__(cls), children
         values = {"period": period, "delay": delay, "rate": None}
         if structure:
-            # Convert the delay to seconds unless JAX passes derivatives, or objects that cannot be multiplied.
+            # Convert the delay to seconds, except if JAX passes derivatives, or placeholders that cannot be multiplied.
             with suppress(TypeError):
                 values["delay"] = delay if _is_derivative(period, delay) else delay * period
             values |= {"_periods": delay, "in_periods": True}

@@ -44,8 +44,8 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 _FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar also has ticks at 2 and 5
 _LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
-# Number of poses per axis. On a grid with at least this many on both axes, colors are interpolated between poses. On a
-# coarser grid, every pose has a tick on axes with at most this many poses.
+# A number of poses per axis. If both axes have at least this number, colors are interpolated between the poses.
+# Otherwise each pose is a cell of one color, and an axis with at most this number of poses has a tick at each pose.
 _SMOOTH_GRID = 12
 _SEEN = 0.003  # fraction of a panel that corner optima must fill for a legend entry
 # Line style of boundaries, and style of the marker at the stiffest stable wall.

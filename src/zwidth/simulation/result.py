@@ -94,7 +94,7 @@ OF_WHOLE = {
     "outcome": ("code of the observed behavior", "1"),
     "status": ("status code", "1"),
 }
-# SI unit of each of these fields that contains a quantity.
+# SI units of the fields above that contain quantities.
 UNITS: dict[str, Any] = {name: unit for name, (_, unit) in OF_WHOLE.items() if name not in ("outcome", "status")}
 # Fields of `Motion` that are unknown for a linear system.
 OF_ENERGY = {"wall_work", "external_work", "damping_loss", "friction_loss", "energy", "wall_work_max"}

@@ -62,7 +62,7 @@ def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse)
         realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles)),
     )
     # The states are those of the program, the velocity filter and the tool.
-    # Each signal is a row vector: the factors of all states and, in the last column, of the device position x.
+    # A row vector represents each signal: its coefficients of all states and, in the last column, of the position x.
     # ``rest`` and ``spring`` do not depend on the tool position y. The velocity filter has the input rest - y,
     # and the coupling has the force spring - alpha y + beta (output of the filter).
     sizes = [len(program.A), len(difference.A), len(response.A)]

@@ -94,7 +94,7 @@ def _factor(estimate: Estimate) -> FactoredPlant:
 
 
 def _multiply(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
-    """Return the product of two filters, all given by gain, lag, zeros and poles."""
+    """Return the product of two filters; the factors and the product are given by gain, lag, zeros and poles."""
     zeros, poles = ([getattr(each, name) for each in (first, second)] for name in ("zeros", "poles"))
     return FactoredPlant(first.gain * second.gain, first.lag + second.lag, np.concatenate(zeros), np.concatenate(poles))
 

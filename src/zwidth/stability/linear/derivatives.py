@@ -1,4 +1,4 @@
-"""Compute exact derivatives of results, such as a margin, in all numbers of a scene, in NumPy.
+"""Compute exact derivatives of results, such as a margin, by the numerical parameters of a scene, in NumPy.
 
 F is the velocity estimate, q = -1/G the critical controller, ``r = alpha + beta F - q``, and ``z = e^lambda``. A wall
 (alpha, beta) has a pole at z if and only if r is 0 there. Results such as the stiffest wall or a margin solve equations
@@ -69,7 +69,7 @@ class StateTerms:
 
 
 class LoopTerms:
-    """Taylor expansions of q = -1/G and of F in the numbers of a scene and in further variables.
+    """Taylor expansions of q = -1/G and of F by the numerical parameters of a scene and by further variables.
 
     If the scene has a position estimate P and a velocity estimate V, F is the ratio V/P; otherwise F is the velocity
     estimate.
@@ -245,7 +245,7 @@ def differentiate(
     equations: Equations,
     added_delay: float | None = None,
 ) -> list[Taylor]:
-    """Return the solution of equations, with its derivatives in the numbers of a scene and in further parameters.
+    """Return the solution of equations, with its derivatives by the numbers of a scene and by further parameters.
 
     Args:
         scene: the scene, whose numbers are floats.

@@ -93,9 +93,9 @@ class SlowToolModel:
             beta: normalized damping, of the same shape.
 
         Returns:
-            Eigenvalues minus 1, shape (couplings, states), and logarithms, shape (couplings,). A logarithm is set to 0
-            if it does not exceed the rounding error of its eigenvalue. If a monodromy matrix overflows, its eigenvalues
-            are NaN, but its logarithm is valid. If H or S is not finite, both are NaN.
+            Eigenvalues minus 1, shape (couplings, states), and logarithms, shape (couplings,). A logarithm is 0 if
+            its absolute value is within the rounding error of its eigenvalue. If a monodromy matrix overflows, its
+            eigenvalues are NaN, but its logarithm is valid. If H or S is not finite, both are NaN.
         """
         size = len(self.drift)
         multipliers, logs = np.full((alpha.size, size), complex(np.nan)), np.full(alpha.size, np.nan)
