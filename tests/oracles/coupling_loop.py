@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from program_loop import Filter, Program, draw_scene, find_difference, find_plant
-from scipy.linalg import expm
+from program_loop import Filter, Program, close_loop, draw_scene, find_difference
 
 import zwidth
 
@@ -74,24 +73,7 @@ class Coupling:
 
 def step_coupling(scene: Any, K: float, B: float) -> np.ndarray:
     """Return the matrix of one period of the closed loop with a virtual coupling."""
-    T, d = scene.timing.period, scene.d
-    n, f = int(np.floor(d)), d - np.floor(d)
-    A, b, C = find_plant(scene)
-    size = len(b)
-    block = np.zeros((size + 1, size + 1))
-    block[:size, :size], block[:size, size] = A, b
-    first, last = expm(block * f * T), expm(block * (1 - f) * T)
-    program = Coupling(scene, K, B)
-    total = size + n + 1 + program.size
-    columns = []
-    for unit in np.eye(total):
-        x, queue, state = unit[:size], unit[size : size + n + 1], unit[size + n + 1 :]
-        state, force = program.step(state, C @ x)
-        forces = np.concatenate([[force], queue])
-        x = first[:size, :size] @ x + first[:size, size] * forces[n + 1]
-        x = last[:size, :size] @ x + last[:size, size] * forces[n]
-        columns.append(np.concatenate([x, forces[: n + 1], state]))
-    return np.array(columns).T
+    return close_loop(scene, Coupling(scene, K, B))
 
 
 def find_coupling_radius(scene: Any, K: float, B: float) -> float:

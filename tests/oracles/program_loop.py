@@ -163,6 +163,15 @@ def find_plant(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def step_matrix(scene: Any, K: float, B: float) -> np.ndarray:
     """Return the matrix of one period of the closed loop with a wall."""
+    return close_loop(scene, Program(scene, K, B))
+
+
+def close_loop(scene: Any, program: Any) -> np.ndarray:
+    """Return the matrix of one period of the device and the delay of a scene in a loop with a program.
+
+    The attribute ``size`` of the program is its number of states; its method ``step`` maps the states and the measured
+    position to the new states and the force.
+    """
     T, d = scene.timing.period, scene.d
     n, f = int(np.floor(d)), d - np.floor(d)
     A, b, C = find_plant(scene)
@@ -170,7 +179,6 @@ def step_matrix(scene: Any, K: float, B: float) -> np.ndarray:
     block = np.zeros((size + 1, size + 1))
     block[:size, :size], block[:size, size] = A, b
     first, last = expm(block * f * T), expm(block * (1 - f) * T)
-    program = Program(scene, K, B)
     total = size + n + 1 + program.size
     columns = []
     for unit in np.eye(total):

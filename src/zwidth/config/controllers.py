@@ -170,7 +170,7 @@ def derive_keys(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def find_second_wall(raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Yield a problem for each key in `DERIVED` that is given together with a controller."""
+    """Yield an error for each key of the scene that its controller already determines (`DERIVED`)."""
     for name in DERIVED if raw.get("controller") is not None else ():
         if raw.get(name) is not None:
             allowed = "the gains of the controller determine it"

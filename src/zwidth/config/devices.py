@@ -180,7 +180,7 @@ def read_device_form(raw: Any) -> _Section:
 
 
 def replace_rigid(raw: dict[str, Any]) -> dict[str, Any]:
-    """Replace the key ``device`` by ``mass`` and ``damping`` if its value is an arm that moves like one mass.
+    """Replace the key ``device`` by ``mass`` and ``damping`` if it is an arm that moves like a rigid mass.
 
     Return the mapping ``raw`` unchanged if it contains another device. Also return it unchanged if the arm is invalid,
     or if the mapping contains mass or damping, because the subsequent validation reports these errors.

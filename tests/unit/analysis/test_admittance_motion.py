@@ -39,11 +39,8 @@ def test_motions_decay_below_the_limit_and_grow_above(seed):
     rng = np.random.default_rng(seed)
     display, _ = make_display(rng)
     limit = display.max_environment_stiffness()
-    if limit.status != zwidth.Status.OK:
-        pytest.skip("no environment is stable")
+    assert limit.status == zwidth.Status.OK
     periods = int(60 / (limit.frequency * display.timing.period))
-    if periods > 100_000:
-        pytest.skip("a slow oscillation takes long")
     pulse = np.zeros(periods + 1)
     pulse[0] = 1.0
     for share, grows in ((0.98, False), (1.02, True)):

@@ -135,7 +135,7 @@ class SlowToolModel:
 
 
 def find_rigid_displacement(chain: AnyChain, psi: Array) -> Array | None:
-    """Return the states of a device at rest at the position 1; None if the device has no pole at z = 1.
+    """Return the state of the device at rest at position 1; None if it cannot rest there without a force.
 
     Args:
         chain: model of the device.
